@@ -24,7 +24,7 @@ check: ## check lint, format, types and declared dependencies
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
-	@.venv/bin/deptry src research
+	@.venv/bin/deptry src research tools
 
 docs: ## build the documentation site into outputs/site; broken links fail (ARGS="serve" for a preview)
 	@scripts/setup

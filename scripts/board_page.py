@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from lerobot_memobench.board.rows import BoardRow, board_rows, evidence_text, pauses_text, rate_text
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE
+from tools.board.rows import BoardRow, board_rows, evidence_text, pauses_text, rate_text
 
 BOARD = Path(__file__).resolve().parents[1] / "results" / "board"
 PLACE = "<!-- board -->"

@@ -1,7 +1,7 @@
 """Run a row of the board anew with this version: ``python scripts/renew_row.py results/board/NAME OUT``.
 
 The evaluation and its controls run with the settings of the row's cards into OUT/NAME; the same command resumes them.
-Then they replace the row. ``python -m lerobot_memobench.board results/board`` checks the board;
+Then they replace the row. ``python -m tools.board results/board`` checks the board;
 ``results/board/reruns.json`` needs the new digest. An evaluation in OUT/NAME that another command has made, such as
 one with ``shards=``, is completed and taken.
 """

@@ -70,16 +70,17 @@ def test_ten_minutes_runs_and_resumes(tmp_path: Path) -> None:
     assert (tmp_path / "memory" / "checkpoints" / "last").stat().st_mtime == trained
 
 
-# --- paper_figures.py ---
+# --- paper/figures.py ---
 
 
 def test_paper_figures_match_the_papers_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Appendix "Radar Summaries" names the best policy on each axis; the main table gives Pearson's r."""
-    report_command = ["report", logs.evaluation(tmp_path / "a", 1), "--with", "paper", "--format", "json"]
+    report_command = ["report", logs.evaluation(tmp_path / "a", 1), "--format", "json"]
     assert memobench([*map(str, report_command), "--out", str(tmp_path / "report")]) == 0
     report_file = tmp_path / "report" / "report.json"
     monkeypatch.setattr(sys, "argv", ["x", str(report_file), "--out", str(tmp_path)])
-    script = runpy.run_path(str(EXAMPLES / "paper_figures.py"), run_name="__main__")
+    monkeypatch.syspath_prepend(EXAMPLES / "paper")
+    script = runpy.run_path(str(EXAMPLES / "paper" / "figures.py"), run_name="__main__")
     assert all((tmp_path / f"{name}.pdf").is_file() for name in ("radar", "correlations", "prefix"))
     rows = [row for row in script["rows_of"](json.loads(report_file.read_text()), "main") if row.published]
     best = script["best_over_replan"](rows)

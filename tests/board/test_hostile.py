@@ -13,10 +13,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.board.__main__ import main as check_board
-from lerobot_memobench.board.check import check_author, check_paths, check_submission, read_board
-from lerobot_memobench.board.rows import board_rows
-from lerobot_memobench.board.submission import CARD, LOG, About, read_submission, write_submission
+from lerobot_memobench.board.submission import CARD, LOG, About, write_submission
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.sealed import policy_hash, scenes_hash
@@ -33,6 +30,10 @@ from tests.support.board import (
     sealed,
     stating,
 )
+from tools.board.__main__ import main as check_board
+from tools.board.check import check_author, check_paths, check_submission, read_board
+from tools.board.rows import board_rows
+from tools.board.submission import read_submission
 
 Json = dict[str, Any]
 Change = Callable[[Path], object]
@@ -263,7 +264,7 @@ STRICT: dict[str, tuple[Change, str]] = {
         in_card(lambda card: card["checkpoint"].update(files={**FILES, "model.safetensors": "4" * 64})),
         "the policy's sha256",
     ),
-    "lines of a similar policy": (every(lambda record: record.update(policy="act_large 0123")), "of the policy"),
+    "lines of a similar policy": (every(lambda record: record.update(policy="act_large 0123")), "policy.type: act and"),
     "versions of other years": (
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
         "the card names lerobot 0.1.0",
@@ -273,13 +274,13 @@ STRICT: dict[str, tuple[Change, str]] = {
         "the card names mujoco not 3",
     ),
     # seeds
-    "seeds named as sealed": (both(relabelled, commit()), "drew the variants"),
+    "seeds named as sealed": (both(relabelled, commit()), "expected a salt with the sealed"),
     "sealed for another policy": (both(sealed, commit(policy="5" * 64)), r"match \(policy"),
     "sealed in another release": (both(sealed, commit(release="0.1.0")), r"match \(release"),
     "run 0 of the sealed test": (both(sealed, commit(run=0)), "run|greater"),
     "sealed without a salt": (
         both(sealed, every(lambda record: record.pop("salt")), protocol(salt=None), commit()),
-        "drew the variants",
+        "expected a salt with the sealed",
     ),
     "a salt that draws other variants": (
         both(sealed, every(lambda record: record.update(salt="6" * 32)), protocol(salt="6" * 32), commit()),
@@ -290,7 +291,7 @@ STRICT: dict[str, tuple[Change, str]] = {
         "expected a salt with the sealed",
     ),
     "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
-    "another salt on the card": (both(sealed, protocol(salt="6" * 32), commit()), "salt=555"),
+    "another salt on the card": (both(sealed, protocol(salt="6" * 32), commit()), "salt: 666"),
     "sealed for another salt": (both(sealed, commit(scenes="7" * 64)), r"match \(scenes"),
     "a second run without a first": (both(sealed, commit(run=2)), r"match \(run: 2 there, 1"),
     # statements
@@ -322,8 +323,8 @@ PUBLISHED: dict[str, tuple[Change, str]] = {
         failures(lambda record: record.update(success=True, failure=None, steps=1000)),
         "without the checkpoint|the goal ends a rollout",
     ),
-    "lost goals": (failures(lambda record: record.update(lost=True)), "has lost=True"),
-    "seeds named as sealed": (both(relabelled, commit()), "drew the variants"),
+    "lost goals": (failures(lambda record: record.update(lost=True)), "suite: published and strict"),
+    "seeds named as sealed": (both(relabelled, commit()), "expected a salt with the sealed"),
 }
 
 

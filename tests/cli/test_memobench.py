@@ -186,7 +186,7 @@ def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: 
 
 def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
     a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", successes=3)
-    out, paper = tmp_path / "out", tmp_path / "paper"
+    out = tmp_path / "out"
     words = ["--format", "csv", "--format", "json", "--format", "latex"]
     assert main(["report", a, b, *words, "--out", str(out)]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex", "tables"]
@@ -206,8 +206,6 @@ def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
     assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]
     assert [row["object SR"] for row in tables["overview"]] == ["", ""]
     assert [float(row["average SR"]) for row in tables["overview"]] == [50.0, 75.0]
-    assert main(["report", a, "--format", "json", "--with", "paper", "--out", str(paper)]) == 0
-    assert len(json.loads((paper / "report.json").read_text())["paper"]) == 43
 
 
 def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

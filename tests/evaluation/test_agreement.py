@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.board.exports import huggingface_yaml, lerobot_json, vla_eval_json
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeRecord, write_episodes
 from lerobot_memobench.envs.settings import SCENE_HASHES, EnvSettings
@@ -100,32 +99,13 @@ def test_missing_episodes_are_named_everywhere(killed: Path, tmp_path: Path) -> 
             assert "1,498 of 1,500 episodes" in " ".join(file.read_text().split()), (words, kind)
 
 
-def test_an_incomplete_run_is_exported_as_such(killed: Path) -> None:
-    (run,) = read_runs([killed])
-    (entry,) = json.loads(vla_eval_json(run))["results"]
-    assert (entry["overall_score"], entry["task_scores"]["reported_avg"]) == (None, 100.0)
-    provenance = json.loads(lerobot_json(run))["provenance"]
-    assert (provenance["episodes_per_task"], provenance["missing"]) == (2, run.missing)
-    for text in (entry["notes"], huggingface_yaml(run, "user/memobench")):
-        assert "50 episodes" not in text
-        assert "2 episodes of check_all_three_drawers_of_the_cabinet" in text
-        assert "1,498 of" in text
-
-
-def test_an_export_counts_lines_without_a_protocol(killed: Path, tmp_path: Path) -> None:
-    write_episodes(tmp_path / "a", [line(name, 49) for name in task_names()])
-    (entry,) = json.loads(vla_eval_json(*read_runs([tmp_path / "a"])))["results"]
-    assert entry["overall_score"] is None
-
-
 FIXED_GOALS = "a routine without a memory solves published goals"
 
 
-def test_a_complete_run_has_an_overall_score(tmp_path: Path) -> None:
+def test_a_complete_run_is_not_called_incomplete(tmp_path: Path) -> None:
     lines = [line(name, episode) for name in task_names() for episode in range(50)]
     (run,) = read_runs([evaluation(tmp_path / "whole", lines)])
-    (entry,) = json.loads(vla_eval_json(run))["results"]
-    assert (run.missing, entry["overall_score"]) == (None, 100.0)
+    assert run.missing is None
     assert [note.split(" with ")[0] for note in run.notes] == [FIXED_GOALS]
     assert "incomplete" not in headline([run])
 

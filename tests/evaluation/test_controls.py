@@ -1,4 +1,4 @@
-"""Controls: found by their setting, refused in the wrong place, shown in every report, and the paper's figures."""
+"""Controls: found by their setting, refused in the wrong place, and shown in every report."""
 
 from __future__ import annotations
 
@@ -122,19 +122,14 @@ def test_share_of_the_gap(first: float | None, second: float, closed: float | No
     assert gap_closed(first, second) == (None if closed is None else pytest.approx(closed))
 
 
-def test_oracle_memory_closes_a_share_of_the_gap_as_the_papers_does(tmp_path: Path) -> None:
-    """Paper: "oracle memory closes 45.5% of the MUR gap and 54.9% of the MCR gap, but only 20.2% of the MSR gap"."""
+def test_oracle_memory_closes_a_share_of_the_gap(tmp_path: Path) -> None:
     plain = evaluation(tmp_path / "plain", [1, 1, 0, 0])
     oracle = evaluation(tmp_path / "oracle", [3, 1, 1, 0], policy="b", oracle_memory=True)
-    words = ["--with", "paper", "--format", "json", "--format", "markdown", "--out", str(tmp_path)]
+    words = ["--format", "json", "--out", str(tmp_path)]
     assert main(["compare", plain, oracle, *words]) == 0
     found = rows_of(tmp_path)["temporal", "MSR"]
     assert (found["a"], found["b"], found["gap_closed"]) == (50, 75, 50)
     assert found["gap_closed_low"] < 50 < found["gap_closed_high"] <= 100
-    (average,) = [
-        line for line in (tmp_path / "compare.md").read_text().splitlines() if line.startswith("| **average**")
-    ]
-    assert [cell.strip("* ") for cell in average.split("|")][-4:-1] == ["20.2", "45.5", "54.9"]
 
 
 # --- shuffled memory ---
@@ -148,14 +143,11 @@ def test_shuffled_memory_is_compared_checkpoint_by_checkpoint(tmp_path: Path) ->
 
     normal = evaluation(tmp_path / "normal", reach(38, 26, 4))
     shuffled = evaluation(tmp_path / "shuffled", reach(45, 12, 1), "b", policy_settings={"align_targets": "shuffled"})
-    words = ["--with", "paper", "--format", "json", "--format", "markdown", "--out", str(tmp_path)]
+    words = ["--format", "json", "--out", str(tmp_path)]
     assert main(["compare", normal, shuffled, *words]) == 0
     found = [rows_of(tmp_path)[STOVE, f"c{k}"] for k in (1, 2, 3)]
     assert [(row["a"], row["b"]) for row in found] == [(76, 90), (52, 24), (8, 2)]
     assert found[1]["high"] < 0
-    text = (tmp_path / "compare.md").read_text()
-    assert "| normal | 76.0 | 52.0 | 8.0 |" in text
-    assert "| shuffled | 90.0 | 24.0 | 2.0 |" in text
 
 
 def test_a_checkpoint_after_a_missed_one_does_not_count(tmp_path: Path) -> None:
@@ -166,12 +158,6 @@ def test_a_checkpoint_after_a_missed_one_does_not_count(tmp_path: Path) -> None:
     assert [rows_of(tmp_path)[STOVE, f"c{k}"]["a"] for k in (1, 2, 3)] == [0, 0, 0]
 
 
-def test_the_paper_has_no_figures_of_other_comparisons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = evaluation(tmp_path / "a", [1]), evaluation(tmp_path / "b", [1], policy="b")
-    assert main(["compare", a, b, "--with", "paper"]) == 2
-    assert "--with paper" in capsys.readouterr().err
-
-
 # --- granularity ---
 
 
@@ -180,7 +166,7 @@ def test_granularity_counts_each_level_by_its_own_labels(tmp_path: Path) -> None
     for level, reached in (("coarse", [3, 3, 0]), ("intermediate", [2, 2, 2]), ("fine", [2, 0, 0])):
         settings = {"subgoal_level": level}
         words.append(evaluation(tmp_path / level, reached, level, "SUC", DRAWERS, policy_settings=settings))
-    out = ["--format", "json", "--format", "markdown", "--with", "paper", "--out", str(tmp_path)]
+    out = ["--format", "json", "--out", str(tmp_path)]
     assert main(["report", *words, *out]) == 0
     found = json.loads((tmp_path / "report.json").read_text())
     own = {name: rates["own_labels"] for name, rates in found["granularity"].items()}
@@ -189,7 +175,6 @@ def test_granularity_counts_each_level_by_its_own_labels(tmp_path: Path) -> None
     assert own["intermediate"] == {"SR": 0.0, "MSR": 100.0, "MUR": 100.0, "MCR": 0.0}
     assert own["fine"] == {"SR": 0.0, "MSR": 33.3, "MUR": 16.7, "MCR": None}
     assert found["evaluations"]["fine"]["average"]["MUR"] == 33.3
-    assert "coarse 4/50" in (tmp_path / "report.md").read_text()
     assert main(["report", *words[:1], *out]) == 0
     assert "granularity" not in json.loads((tmp_path / "report.json").read_text())
 

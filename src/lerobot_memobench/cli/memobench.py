@@ -43,7 +43,7 @@ from lerobot_memobench.tasks.gap import longest_gap
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED, Task
 
 if TYPE_CHECKING:
-    from lerobot_memobench.doctor.examination import Finding
+    from lerobot_memobench.doctor import Finding
 
 COLOURS = {
     **{"ok": "green", "warning": "yellow"},
@@ -155,14 +155,14 @@ def doctor(
     """Check that this machine can run the benchmark. Each problem comes with its fix."""
     from dataclasses import asdict
 
-    from lerobot_memobench.doctor.examination import examine, exit_status
+    from lerobot_memobench.doctor import examine
 
     findings = examine()
     if as_json:
         print(json.dumps([asdict(finding) for finding in findings], indent=1))
     else:
         console().print(finding_table(findings))
-    return exit_status(findings)
+    return int(any(finding.status == "failed" for finding in findings))
 
 
 def finding_table(findings: Sequence[Finding]) -> Table:

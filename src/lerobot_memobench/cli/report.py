@@ -29,15 +29,8 @@ class ReportFormat(StrEnum):
     JSON = "json"
 
 
-class Published(StrEnum):
-    """Published figures that a report can add."""
-
-    PAPER = "paper"
-
-
 ENDINGS = {ReportFormat.TABLE: "txt", ReportFormat.MARKDOWN: "md", ReportFormat.LATEX: "tex", ReportFormat.JSON: "json"}
 
-With = Annotated[Published | None, typer.Option("--with", help="paper: add the published figures.")]
 Formats = Annotated[
     list[ReportFormat] | None,
     typer.Option("--format", help="table (default), markdown, csv, latex or json; repeatable."),
@@ -53,7 +46,6 @@ def report(
         ),
     ],
     format_: Formats = None,
-    with_: With = None,
     out: Annotated[Path | None, typer.Option(help="Write the report to this folder instead of printing it.")] = None,
     html: Annotated[
         Path | None, typer.Option(help="Write a page for the browser with all videos to this folder.")
@@ -76,7 +68,7 @@ def report(
     for run in runs:
         for each in run.evaluations:
             _write_next_to_log(each)
-    show_report(build(runs, with_ is Published.PAPER), "report", format_, out)
+    show_report(build(runs), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
 
@@ -114,7 +106,6 @@ def compare(
         typer.Option(help="A setting that is meant to differ, such as replan_steps; repeatable.", metavar="NAME"),
     ] = None,
     format_: Formats = None,
-    with_: With = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for compare.md, compare.tex, compare.json and so on.")
     ] = None,
@@ -131,8 +122,7 @@ def compare(
 
     first, second = read_runs([a, b])
     found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    written = comparison_report(found, with_ is Published.PAPER)
-    show_report(written, "compare", format_, out, comparison_csv(found))
+    show_report(comparison_report(found), "compare", format_, out, comparison_csv(found))
 
 
 def merge(

@@ -18,7 +18,7 @@ from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.agreement import SCENES
-from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed, published_table
+from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
@@ -432,24 +432,9 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(comparison: Comparison, paper: bool = False) -> Report:
-    """Return a comparison as tables and JSON values.
-
-    Args:
-        paper: add the published figures of the control.
-
-    Raises:
-        MemobenchError: they are asked for, and the paper has none of this comparison.
-    """
+def comparison_report(comparison: Comparison) -> Report:
+    """Return a comparison as tables and JSON values."""
     section = comparison_section(comparison)
-    if paper:
-        published = published_table(comparison.control) if comparison.control else None
-        if published is None:
-            raise MemobenchError(
-                "the paper has no figures of this comparison, only of oracle and of shuffled memory; leave out "
-                "--with paper"
-            )
-        section = replace(section, tables=(*section.tables, published))
     title = f"{section.title}: {comparison.headline}"
     return Report(title, [replace(section, title="")], comparison_data(comparison))
 

@@ -16,11 +16,10 @@ from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import AVERAGE, published_rate
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, Cell, Section, Table, figure
-from lerobot_memobench.paper import raw_tables, shuffled_control
+from lerobot_memobench.evaluation.report_tables import AVERAGE
+from lerobot_memobench.evaluation.tables import Cell, Section, Table
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
+from lerobot_memobench.tasks.task import LEVELS
 
 LEAST_GAP = 0.01
 """Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
@@ -167,42 +166,7 @@ def gap_closed(first: float | None, second: float | None) -> float | None:
     return (second - first) / (1.0 - first)
 
 
-# --- the paper's figures ---
-
-
-def published_table(control: Control) -> Table | None:
-    """Return the paper's figures of a control, None where it has none."""
-    if control.gap_closed:
-        return _published_oracle()
-    return _published_shuffled() if control.by_checkpoint else None
-
-
-def _published_oracle() -> Table:
-    tables = raw_tables()["oracle_memory"]
-    rows = []
-    for name in (*MEMORY_TYPES, "average"):
-        figures = [[tables[model][name][metric] for model in ("standard_pi05", "oracle_pi05")] for metric in METRICS]
-        pairs = [[published_rate(value).value for value in pair] for pair in figures]
-        cells = [NOT_APPLICABLE if a is None else f"{figure(a)}/{figure(b)}" for a, b in pairs]
-        rows.append((name, *cells, *(figure(gap_closed(a, b)) for a, b in pairs)))
-    header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
-    title = f"Paper: standard/oracle memory, replan interval {tables['replan_steps']}"
-    return Table("paper-oracle", title, header, rows, strong={len(rows) - 1})
-
-
-def _published_shuffled() -> Table:
-    published = shuffled_control()
-    change = [b - a for a, b in zip(published["normal"], published["shuffled"], strict=True)]
-    rows = [(name, *(f"{value:.1f}" for value in values)) for name, values in published.items()]
-    rows.append(("difference", *(f"{value:+.1f}" for value in change)))
-    title = "Paper: prefix completion of a temporal task of three checkpoints"
-    return Table("paper-shuffled", title, ("subgoals", *(f"c{k + 1}" for k in range(len(change)))), rows)
-
-
 # --- annotation granularity ---
-
-PAPER_GRANULARITY = "coarse 4/50, intermediate 3/50, fine 3/50"
-"""Successful rollouts of the paper's stove task of three checkpoints by subgoal level; stated in its text only."""
 
 
 def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
@@ -217,7 +181,7 @@ def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
     return {run.name: (level, summarise(with_labels_of(level, run.records))) for run, level in known}
 
 
-def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Section]:
+def granularity_section(runs: Sequence[Run]) -> list[Section]:
     """Return the section of rates by subgoal level, [] unless the policies were taught with several levels."""
     levels = granularity(runs)
     if not levels:
@@ -228,13 +192,11 @@ def granularity_section(runs: Sequence[Run], paper: bool = False) -> list[Sectio
         for name, (level, own) in levels.items()
     ]
     header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
-    sentences = [
+    sentence = (
         f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
         f"level: {AVERAGE}, per cent, with Wilson's 95 % interval over rollouts."
-    ]
-    if paper:
-        sentences.append(f"The paper's successes in a stove task of three checkpoints: {PAPER_GRANULARITY}.")
-    return [Section("Annotation granularity", [Table("granularity", "", header, rows)], sentences)]
+    )
+    return [Section("Annotation granularity", [Table("granularity", "", header, rows)], [sentence])]
 
 
 def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:

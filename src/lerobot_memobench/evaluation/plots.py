@@ -2,7 +2,7 @@
 
 Colours are safe for the colour-blind; hatches, markers and dashes keep them apart in grey. Operations have the colours
 of videos and of the HTML report (Okabe and Ito's palette). The figures of the paper are drawn by
-``examples/paper_figures.py``.
+``examples/paper/figures.py``.
 """
 
 from __future__ import annotations

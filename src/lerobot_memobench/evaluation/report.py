@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +22,11 @@ from lerobot_memobench.evaluation.metrics import Rate, Row, percent, report_valu
 from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
-    check_paper_rows,
-    departures,
     failures_table,
     inputs_sentence,
     joined_table,
     memory_types_table,
     overview,
-    paper_section,
     pooled_sentence,
     prefix_table,
     sweep,
@@ -37,7 +34,6 @@ from lerobot_memobench.evaluation.report_tables import (
 )
 from lerobot_memobench.evaluation.tables import Report, Section, markdown
 from lerobot_memobench.io import write_file
-from lerobot_memobench.paper import published_rows
 
 REPORT_JSON = "report.json"
 REPORT_MARKDOWN = "report.md"
@@ -75,22 +71,14 @@ def write_report(directory: str | Path) -> Run:
 # --- documents ---
 
 
-def build(runs: Sequence[Run], paper: bool = False) -> Report:
-    """Return the report of one or several evaluations.
-
-    Args:
-        paper: add the published figures.
-
-    Raises:
-        MemobenchError: the published figures are of other tasks.
-    """
-    check_paper_rows(runs, paper)
+def build(runs: Sequence[Run]) -> Report:
+    """Return the report of one or several evaluations."""
     sections, controls = [], list(controls_among(runs))
     if len(runs) > 1:
         sections.append(Section("Evaluations", [overview(runs), joined_table(runs)], notes=unlike(runs)))
     sections += [sweep(method, group) for method, group in sweeps(runs).items()]
     sections += [comparison_section(each, overall=True) for each in controls]
-    sections += granularity_section(runs, paper)
+    sections += granularity_section(runs)
     for run in runs:
         section = _section(run)
         if len(runs) > 1:  # their rates by task are joined
@@ -98,9 +86,7 @@ def build(runs: Sequence[Run], paper: bool = False) -> Report:
             tables = [table for table in section.tables if table.key != "tasks"]
             section = replace(section, title=run.name, tables=tables, sentences=[where, *section.sentences])
         sections += [section, *_evidence(run)]
-    if paper:
-        sections.append(paper_section(runs))
-    return Report(headline(runs), sections, report_data(runs, controls, paper))
+    return Report(headline(runs), sections, report_data(runs, controls))
 
 
 def _section(run: Run) -> Section:
@@ -125,8 +111,8 @@ def evidence_values(run: Run) -> dict[str, Any]:
 # --- JSON ---
 
 
-def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool) -> dict[str, Any]:
-    """Return the figures of one or several evaluations, and the published ones where asked for."""
+def report_data(runs: Sequence[Run], controls: Sequence[Comparison]) -> dict[str, Any]:
+    """Return the figures of one or several evaluations."""
     if len(runs) == 1:
         data = run_data(runs[0])
     else:
@@ -137,9 +123,6 @@ def report_data(runs: Sequence[Run], controls: Sequence[Comparison], paper: bool
             data["granularity"] = levels
     if swept := sweeps(runs):
         data["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
-    if paper:
-        data["departs_from_paper"] = {run.name: departures(run) for run in runs}
-        data["paper"] = [asdict(row) for row in published_rows()]
     return data
 
 

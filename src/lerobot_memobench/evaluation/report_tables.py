@@ -1,14 +1,11 @@
-"""Tables, sections and sentences of a report: of one evaluation, of several, and with the paper's figures."""
+"""Tables, sections and sentences of a report: of one evaluation and of several."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import with_omitted
-from lerobot_memobench.envs.settings import PICTURES
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Rate, Row, Summary, percent, policy_inputs
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, SUITE, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
@@ -22,11 +19,8 @@ from lerobot_memobench.evaluation.tables import (
     with_ids,
 )
 from lerobot_memobench.io import count_of
-from lerobot_memobench.paper import failure_taxonomy, published_rows
-from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import GROUPS
-from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 
 def inputs_sentence(words: str) -> str:
@@ -191,14 +185,15 @@ NOTE = "inputs: of the policy; k: the replan interval."
 def overview(runs: Sequence[Run]) -> Table:
     """Return one row per evaluation; the note names the settings in which they differ."""
     columns = columns_of(runs)
-    rows = [(*_leading(run), *all_rates(run.summary, columns)) for run in runs]
+    rows = [run_row(run, columns) for run in runs]
     note = " ".join([NOTE, *unlike(runs)])
-    wide = _wide(LEADING, columns, runs[0].summary.average)
+    wide = wide_columns(LEADING, columns, runs[0].summary.average)
     return Table("overview", "Evaluations", rows=rows, note=note, best=best_in_columns(rows), **wide)
 
 
-def _leading(run: Run) -> tuple[Cell, ...]:
-    return run.name, run.summary.inputs, run.replan_steps
+def run_row(run: Run, columns: Sequence[str] = PAPER_COLUMNS) -> tuple[Cell, ...]:
+    """Return the row of an evaluation: its cells under `LEADING`, and `all_rates`."""
+    return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary, columns))
 
 
 def all_rates(summary: Summary, columns: Sequence[str]) -> list[Rate]:
@@ -216,7 +211,7 @@ def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(name for name in GROUPS if name in suites) + PAPER_COLUMNS[-1:] * (len(suites) > 1)
 
 
-def _wide(leading: tuple[str, ...], columns: Sequence[str], metrics: Iterable[str]) -> dict[str, Any]:
+def wide_columns(leading: tuple[str, ...], columns: Sequence[str], metrics: Iterable[str]) -> dict[str, Any]:
     """Return header and groups of a table whose rows are leading cells, then ``metrics`` under each of ``columns``."""
     metrics = tuple(metrics)
     groups = (*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns))
@@ -286,7 +281,7 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             rows=types,
             note=inputs,
             best=best_in_columns(types),
-            **_wide(("replan interval",), columns, first.average),
+            **wide_columns(("replan interval",), columns, first.average),
         ),
     )
     best = [
@@ -309,102 +304,3 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
         return [], None
     best = [run for value, run in zip(values, runs, strict=True) if value == highest]
     return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]
-
-
-# --- with the paper's figures ---
-
-PAPER_PROTOCOL = {
-    **{WORLD: LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True, "horizon": HORIZON},
-    **{"seed_base": EVALUATION_SEED, **PICTURES},
-}
-PAPER_INPUTS = "pixels"
-PAPER_TASKS, PAPER_EPISODES = 30, 50
-
-TABLES = (
-    ("paper-main", "With the paper's main results", ("main",)),
-    ("paper-alignment", "With the paper's memory alignment results", ("alignment",)),
-    ("paper-reference", "With the paper's oracle memory and MemER", ("oracle", "memer")),
-)
-"""Key, title, and which of the paper's tables it holds."""
-
-
-def check_paper_rows(runs: Sequence[Run], paper: bool) -> None:
-    """Refuse to report the paper's figures (``paper``) with those of tasks that it did not publish.
-
-    Raises:
-        MemobenchError: naming the first such evaluation.
-    """
-    other = next((run for run in runs if run.protocol.get("suite", PUBLISHED) != PUBLISHED), None)
-    if paper and other is not None:
-        raise MemobenchError(
-            f"{other.folder} is an evaluation of the {other.protocol['suite']} suite, the paper's figures are of the "
-            "published one; leave out --with paper"
-        )
-
-
-def paper_section(runs: Sequence[Run]) -> Section:
-    """Return the paper's tables of rates with these evaluations in the first rows, and departures from its protocol."""
-    tables = [_paper_table(runs, *each) for each in TABLES]
-    notes = [f"{run.name} departs from the paper's protocol: {', '.join(d)}" for run in runs if (d := departures(run))]
-    return Section("With the paper's figures", [*tables, paper_failures()], notes=notes)
-
-
-def extent(run: Run) -> str:
-    """Return how many tasks and rollouts an evaluation is of, "" where it is as many as the paper's."""
-    summary = run.summary
-    if len(summary.tasks) == PAPER_TASKS and {row["SR"].n for row in summary.tasks.values()} == {PAPER_EPISODES}:
-        return ""
-    return f"{len(summary.tasks)} of {PAPER_TASKS} tasks, {count_of(summary.rollouts, 'rollout')}"
-
-
-def _paper_table(runs: Sequence[Run], key: str, title: str, sources: Sequence[str]) -> Table:
-    """Return a table of the paper's, ours on top, named with their extent: the paper ran 1,500 rollouts."""
-    published = published_rows(*sources)
-    rows: list[tuple[Cell, ...]] = []
-    for run in runs:
-        name, *leading = _leading(run)
-        rows.append((f"{name} ({size})" if (size := extent(run)) else name, *leading))
-        rows[-1] += tuple(all_rates(run.summary, PAPER_COLUMNS))
-    for row in published:
-        types = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
-        rates = [published_rate(figures[metric]) for figures in types for metric in METRICS]
-        rows.append((f"paper: {row.label}", PAPER_INPUTS, row.replan_steps, *rates))
-    steps = [row.replan_steps for row in published]
-    rules = {len(runs), *(len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1])}
-    wide = _wide(LEADING, PAPER_COLUMNS, METRICS)
-    return Table(key, title, rows=rows, note=NOTE, strong=range(len(runs)), rules=rules, **wide)
-
-
-def published_rate(value: float | None) -> Rate:
-    """Return a published percentage as a rate without interval: the paper gives none."""
-    return Rate(None if value is None else value / 100, 0)
-
-
-def paper_failures() -> Table:
-    """Return how the paper's rollouts of its temporal task ended."""
-    counts = failure_taxonomy()
-    total = counts.pop("rollouts")
-    rows = [(name.replace("_", " "), count, Rate(count / total, total)) for name, count in counts.items()]
-    return Table(
-        "paper-failures",
-        f"The paper's outcomes of {total} rollouts of a temporal task with the checkpoints S, U, U",
-        ("outcome", "rollouts", "of all"),
-        rows,
-    )
-
-
-def departures(run: Run) -> list[str]:
-    """Return a phrase for each departure of an evaluation from the paper's protocol."""
-    phrases = []
-    if len(run.summary.tasks) != PAPER_TASKS:
-        phrases.append(f"{len(run.summary.tasks)} of {PAPER_TASKS} tasks")
-    counts = {row["SR"].n for row in run.summary.tasks.values()}
-    if counts != {PAPER_EPISODES}:
-        low, high = min(counts), max(counts)
-        phrases.append(f"{low if low == high else f'{low} to {high}'} episodes of each instead of {PAPER_EPISODES}")
-    known = with_omitted(run.protocol)
-    return phrases + [
-        f"{key.replace('_', ' ')} {known[key]} instead of {value}"
-        for key, value in PAPER_PROTOCOL.items()
-        if key in known and known[key] != value
-    ]

@@ -15,11 +15,9 @@ from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodeP
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import files_below
-from lerobot_memobench.paper import raw_tables
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 CARD_FILE = "README.md"
 MADE_BY = "## How it was made"
@@ -96,14 +94,20 @@ EPISODE_COLUMNS = {
 }
 
 
-FAMILIES: dict[str, dict[str, Any]] = {name: raw_tables()["demo_statistics"][name] for name in (*MEMORY_TYPES, "total")}
+_STATISTICS = ("tasks", "episodes", "steps", "mean", "median", "p95", "max", "gib")
+FAMILIES: dict[str, dict[str, Any]] = {
+    "temporal": dict(zip(_STATISTICS, (10, 500, 198_099, 396.2, 400.5, 679.05, 779, 72.66), strict=True)),
+    "spatial": dict(zip(_STATISTICS, (10, 500, 357_865, 715.73, 727, 1101.1, 1513, 131.58), strict=True)),
+    "object": dict(zip(_STATISTICS, (5, 250, 121_276, 485.1, 492, 526, 556, 44.53), strict=True)),
+    "procedural": dict(zip(_STATISTICS, (5, 250, 250_204, 1000.82, 876, 1649.5, 2012, 91.79), strict=True)),
+    "total": dict(zip(_STATISTICS, (30, 1500, 927_444, 618.3, 489, 1110.1, 2012, 340.56), strict=True)),
+}
 """Rows of the paper's appendix, "Family level statistics"; ``gib``: size of its HDF5 files."""
 LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
-    (int(low), int(high) + 1 if high else None): count
-    for name, count in raw_tables()["length_buckets"].items()
-    for low, _, high in [name.removesuffix("+").partition("-")]
+    **{(0, 200): 50, (200, 400): 199, (400, 600): 687, (600, 800): 108},
+    **{(800, 1000): 290, (1000, 1200): 110, (1200, 1500): 31, (1500, None): 25},
 }
-"""Steps [from, to) -> episodes of 1,500; the paper writes ranges as ``200-399`` and ``1500+``."""
+"""Steps [from, to) -> episodes of the paper's 1,500."""
 
 
 def write_card(

@@ -1,7 +1,8 @@
-"""Rules of the board: a submission is refused with one sentence, without running any part of it.
+"""Check of submissions: each is refused with one sentence, without running any part of it.
 
-The check recounts everything from the log: scenes, variants, tasks and checkpoints are those that this version of the
-package draws. It cannot prove that a rollout took place; therefore the board marks rows that were not rerun.
+`lerobot_memobench.board.rules` holds the rules that an honest evaluation may break. The check here recounts everything
+from the log: scenes, variants and checkpoints are those that this version of the package draws. It cannot prove that a
+rollout took place; therefore the board marks rows that were not rerun.
 """
 
 from __future__ import annotations
@@ -10,49 +11,29 @@ import itertools
 import re
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from packaging.requirements import Requirement
-from packaging.version import InvalidVersion
-
-from lerobot_memobench.board.submission import PAUSES, RERUNS, Evaluation, Submission, read_submission
-from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, OMITTED, POLICY, differences, evidence_line
+from lerobot_memobench.board.rules import FEWEST, MOST, check_control, check_evaluation
+from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.pacing import paused
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, OBJECTS, PICTURES, PIXELS, SCENE_HASHES, EnvSettings
+from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.evaluation.metrics import failure_of, operations, seed_base
+from lerobot_memobench.evaluation.agreement import check_lines
+from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.lerobot_config import tree_hash
-from lerobot_memobench.protocol import (
-    EVALUATION_EPISODES,
-    EVIDENCE_EPISODES,
-    PAPER,
-    PROMPT_HORIZON,
-    SEALED,
-    SPLITS,
-)
-from lerobot_memobench.run.card import PACKAGES, first_variant_mismatch
-from lerobot_memobench.run.sealed import policy_hash, scenes_hash
+from lerobot_memobench.protocol import EVIDENCE_EPISODES, PROMPT_HORIZON
+from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
-from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task
+from lerobot_memobench.tasks.task import STRICT, Task
+from tools.board.submission import Submission, Submitted, read_submission
 
-FEWEST, MOST = 10, EVALUATION_EPISODES
-"""Episodes of each task, without evidence."""
-SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
-"""Seed of the first episode -> split of seeds that count."""
-MAY_DIFFER = {
-    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
-    *("evidence", "salt"),
-}
-"""Settings of the protocol that a submission may choose; all others have their defaults."""
-CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
+RERUNS = "reruns.json"
+"""File of the board, kept by its maintainers: row -> `Submission.digest` of what they ran or repeated."""
 CONTROL_FIELDS = ("paused_steps", "choice", "answered", "variants", "chance")
 """Fields of a line of the log that only evaluations with pauses or evidence have."""
 KNOWN_INPUTS = (PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, NO_INPUT)
@@ -60,10 +41,6 @@ COPIED, CLOSE = 0.5, 2
 """Share of similar successful episodes above which a log counts as a copy, and steps by which similar ones differ."""
 FASTEST = 20
 """Fewest steps to a checkpoint, 1 s; the fastest of 7,764 kept rollouts needed 66."""
-REQUIRED = {
-    found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
-}
-"""Package -> its versions under which this package runs."""
 SCENE = re.compile(r"[0-9a-f]{16}")
 SCRIPTS = ("memobench_expert", "memobench_blind")
 """Policies whose actions the simulator computes."""
@@ -150,162 +127,52 @@ def check_author(author: str, name: str | None, *boards: Path) -> None:
         )
 
 
-def check_submission(submission: Submission, others: Sequence[Submission] = (), *, part: bool = False) -> None:
+def check_submission(submission: Submission, others: Sequence[Submission] = ()) -> None:
     """Check a submission by all rules.
 
     Args:
         others: rows that are on the board already.
-        part: whether any tasks of the suite, and any number of their episodes, will do.
 
     Raises:
         MemobenchError: naming the first rule that it breaks.
     """
     run = submission.evaluation
-    _check_protocol(run)
-    names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
-    fewest = 1 if part else FEWEST
-    _check_evaluation(run, names, fewest)
+    check_evaluation(run)
+    _check_log(run)
     for name, control in submission.controls.items():
-        _check_control(run, control, name, names, fewest)
+        check_control(run, control, name)
+        _check_log(control)
     for other in others:
         _check_original(submission, other)
     _check_scenes([run for each in (*others, submission) for run in (each.evaluation, *each.controls.values())])
 
 
-# --- protocol ---
-
-
-def _fixed_settings(protocol: Mapping[str, Any], **control: Any) -> dict[str, Any]:
-    """Return the settings that the board, and a control, require with the free ones of a protocol."""
-    if protocol.get("suite") in LIBERO_SUITES:
-        raise MemobenchError(f"found suite={protocol['suite']}; the board is of memory tasks, published or strict")
-    board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
-    return {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
-
-
-def departures(protocol: Mapping[str, Any]) -> list[str]:
-    """Return the settings that differ from those of the board; raise for unknown values."""
-    return differences(protocol, _fixed_settings(protocol), ignore=MAY_DIFFER)
-
-
-def _check_protocol(run: Evaluation, **control: Any) -> None:
-    """Check that the card's settings are those of the board, and of a control."""
-    protocol = run.protocol
-    try:
-        fixed = _fixed_settings(protocol, **control)
-    except MemobenchError as error:
-        raise MemobenchError(f"{run.place}: {error}") from None
-    if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
-        raise MemobenchError(
-            f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
-        )
-    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
-        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
-
-
-def _check_control(run: Evaluation, control: Evaluation, name: str, names: Sequence[str], fewest: int) -> None:
-    """Check that an evaluation is of the same policy under one control."""
-    _check_protocol(control, **CONTROL_SETTING[name])
-    for key in ("type", "sha256", "settings"):
-        mine, other = (each.card[POLICY].get(key) for each in (run, control))
-        if mine != other:
-            raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
-    if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
-        raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
-    _check_evaluation(control, names, fewest)
-
-
 # --- the log against card, catalogue and seeds ---
 
 
-def _check_evaluation(run: Evaluation, names: Sequence[str], fewest: int) -> None:
-    _check_extent(run, names, fewest)
-    _check_versions(run, names)
+def _check_log(run: Submitted) -> None:
+    """Check that settings and outcomes in the log are those of one evaluation that can have taken place."""
     _check_inputs(run)
     _check_policy(run)
+    check_lines(run.place, {**run.card, "protocol": run.protocol}, run.records)
     for record in run.records:
         _check_record(run, record)
     if (problem := first_variant_mismatch(run.records)) is not None:
         raise MemobenchError(f"{run.place}: another version drew the variants ({problem}); evaluate with this version")
-    if found := disagreements(run.card["episodes"], run.records):
-        raise MemobenchError(f"{run.place}: card and log disagree: {found[0]}; submit both unchanged")
-    _check_sealed(run)
 
 
-def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
-    """Check that one version ran all parts, with the task files of this version."""
-    for package in PACKAGES[:3]:
-        versions = {start["versions"].get(package) for start in run.card["runs"]}
-        if len(versions) > 1:
-            raise MemobenchError(
-                f"{run.place}: its parts ran under {package} {' and '.join(sorted(map(str, versions)))}; evaluate "
-                "again with one version"
-            )
-        for version in map(str, versions):
-            try:
-                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
-            except InvalidVersion:
-                fits = False
-            if not fits:
-                raise MemobenchError(
-                    f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
-                )
-    for name in names:
-        here, there = task_hash(get_task(name)), run.card["task_files"].get(name)
-        if here != there:
-            raise MemobenchError(
-                f"{run.place}: the files of {name} have the hash {str(there)[:16]} on the card and {here} in this "
-                "version; evaluate with this version"
-            )
-
-
-def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
-    """Check that the log holds each episode of each task once, from the first seed of a split on."""
-    protocol, seed = run.protocol, run.card[POLICY].get("seed")
-    count, base, most = protocol["episodes"], protocol["seed_base"], MOST
-    if protocol["evidence"]:  # whole scenes
-        fewest, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
-    if base not in list(SEEDS) or seed != base:
-        raise MemobenchError(
-            f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
-            "of the seeds that count"
-        )
-    if not fewest <= count <= most or sorted(protocol["tasks"]) != sorted(names):
-        raise MemobenchError(
-            f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
-            f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
-        )
-    asked = set(itertools.product(names, range(count)))
-    there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
-    for task, episode in sorted(asked ^ there)[:1]:
-        problem = "is missing in the log" if (task, episode) in asked else "is not part of the protocol"
-        raise MemobenchError(
-            f"{run.place}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
-            f"{len(names)} tasks"
-        )
-
-
-def _check_record(run: Evaluation, record: Mapping[str, Any]) -> None:
-    """Check one line: settings as on the card, seed, and an outcome that this task can have."""
-    protocol, named = run.protocol, (run.records[0].get(POLICY), str(run.card[POLICY].get("type")))
+def _check_record(run: Submitted, record: Mapping[str, Any]) -> None:
+    """Check one line: facts that logs of other tools omit, and an outcome that this task can have."""
+    protocol, policy = run.protocol, run.records[0].get(POLICY)
     where = f"{run.place}: {record['task']}, episode {record['episode']}"
-    settings = ("suite", "world", "difficulty", "protocol", "referent", "salt", "replan_steps", INPUTS)
-    for key in (*settings, *PICTURES, "camera_name_mapping", *MEMORY_CONTROLS):
-        value = record.get(key, OMITTED.get(key))
-        expected = protocol.get(key)
-        if value != expected:
-            raise MemobenchError(f"{where} has {key}={value} and the card {key}={expected}; submit one evaluation only")
-    for part in str(record.get(INPUTS)).split(", "):
+    needed = ("referent", INPUTS, POLICY, "seed", "variant", *(["replan_steps"] if protocol["replan_steps"] else []))
+    if lacking := [key for key in needed if record.get(key) is None]:
+        raise MemobenchError(f"{where} has no {lacking[0]}; evaluate with this version")
+    for part in str(record[INPUTS]).split(", "):
         check_choice(f"{where}: {INPUTS}", part, KNOWN_INPUTS)
-    if record.get(POLICY) != named[0] or str(named[0]).rpartition(" ")[0] != named[1]:
-        raise MemobenchError(f"{where} is of the policy {record.get(POLICY)!r}; expected the policy of the card only")
-    if record.get("seed") is None or seed_base(record) != protocol["seed_base"]:
-        raise MemobenchError(
-            f"{where} has the seed {record.get('seed')}; expected those from {protocol['seed_base']} on, in order"
-        )
-    if (variant := record.get("variant")) is None:
-        raise MemobenchError(f"{where} has no variant; evaluate with this version")
-    task = get_task(record["task"]).variant(variant)
+    if record[POLICY] != policy or str(policy).rpartition(" ")[0] != str(run.card[POLICY].get("type")):
+        raise MemobenchError(f"{where} is of the policy {record[POLICY]!r}; expected the policy of the card only")
+    task = get_task(record["task"]).variant(record["variant"])
     if record["memory_type"] != task.memory_type or operations(record) != task.operations:
         raise MemobenchError(
             f"{where} has other checkpoints than the task ({task.operations}); evaluate with this version"
@@ -379,7 +246,7 @@ def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mappi
         raise MemobenchError(f"{where} has {found}, expected {expected}; submit the log of this control unchanged")
 
 
-def _check_inputs(run: Evaluation) -> None:
+def _check_inputs(run: Submitted) -> None:
     """Check that the inputs on a card agree with its observations, its policy and the policy's features."""
     policy, obs_type = run.card[POLICY], run.protocol["obs_type"]
     kind, settings = str(policy.get("type")), policy.get("settings", {})
@@ -414,7 +281,7 @@ def _block(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _check_policy(run: Evaluation) -> None:
+def _check_policy(run: Submitted) -> None:
     """Check that the hash of a checkpoint is that of its files on the card."""
     there, checkpoint = run.card[POLICY].get("sha256"), run.card["checkpoint"] or {}
     if there != (tree_hash(checkpoint["files"]) if checkpoint.get("files") else None):
@@ -424,7 +291,7 @@ def _check_policy(run: Evaluation) -> None:
         )
 
 
-def _check_scenes(runs: Sequence[Evaluation]) -> None:
+def _check_scenes(runs: Sequence[Submitted]) -> None:
     """Check that each seed of a task has one scene in all evaluations, and that no two seeds share one.
 
     Hashes of scenes depend on MuJoCo, on LIBERO's missing scans and on the version of the hash.
@@ -449,28 +316,6 @@ def _check_scenes(runs: Sequence[Evaluation]) -> None:
                     f"{seed}; {at} has {of_seed[:20]!r} for this seed, and {there} this scene for {of_scene}; expected "
                     "hashes of 16 digits, equal for equal seeds only: one of these folders was changed"
                 )
-
-
-def _check_sealed(run: Evaluation) -> None:
-    """Check that a sealed evaluation, and no other, has a salt, and was committed to its policy and scenes."""
-    is_sealed = SEEDS[run.protocol["seed_base"]] == SEALED
-    if is_sealed != bool(run.protocol["salt"]):
-        raise MemobenchError(
-            f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
-            "others: evaluate them by `memobench test-sealed`"
-        )
-    if not is_sealed:
-        return
-    sealed: Mapping[str, Any] = run.card.get("sealed", {})
-    release = run.card["runs"][0]["versions"].get(PACKAGES[0])
-    expected = {"scenes": scenes_hash(run.card), "policy": policy_hash(run.card), "release": release}
-    expected["run"] = len(sealed.get("earlier", ())) + 1
-    for key, value in expected.items():
-        if (there := sealed.get(key)) != value:
-            raise MemobenchError(
-                f"{run.place}: the commitment of the sealed test does not match ({key}: {str(there)[:12]} there, "
-                f"{str(value)[:12]} by the card); evaluate by `memobench test-sealed`"
-            )
 
 
 # --- copies ---
@@ -514,7 +359,7 @@ def _reached(record: Mapping[str, Any]) -> list[int]:
     return [mark["first_step"] or 0 for mark in record["checkpoints"]]
 
 
-def ranked(run: Evaluation) -> bool:
+def ranked(run: Submitted) -> bool:
     """Return whether an evaluation enters the ranking: strict suite, each scene with each variant, all scenes."""
     return run.protocol["suite"] == STRICT and is_complete(run.protocol)
 

@@ -1,26 +1,25 @@
-"""Each fault of a machine is found and has a fix; rendering here equals the golden frame."""
+"""Each fault of a machine is found and has a fix."""
 
 from __future__ import annotations
 
 import builtins
 import json
 import platform
-import shutil
 import sys
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
+from lerobot_memobench import doctor
+from lerobot_memobench.cli import memobench
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.memobench import finding_table
-from lerobot_memobench.doctor import examination
-from lerobot_memobench.doctor.examination import Finding, exit_status
-from lerobot_memobench.doctor.golden import SIDE, TOLERANCE, difference, read_golden, shrink
+from lerobot_memobench.doctor import Finding
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
+from lerobot_memobench.sim.simulation import Simulation
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> dict[str, str | None]:
 
 
 def test_supported_versions_come_from_the_requirements() -> None:
-    supported = examination.supported_versions()
+    supported = doctor.supported_versions()
     for name, accepted, refused in (("lerobot", "0.6.1", "0.8.0"), ("mujoco", "4.0.0", "3.3.6")):
         assert supported[name].contains(accepted)
         assert not supported[name].contains(refused)
@@ -58,7 +57,7 @@ def test_wrong_or_missing_package_fails(
     installed: dict[str, str | None], name: str, version: str | None, fix: str
 ) -> None:
     installed[name] = version
-    findings = {finding.what: finding for finding in examination.package_versions()}
+    findings = {finding.what: finding for finding in doctor.package_versions()}
     assert findings[name].status == "failed"
     assert findings[name].fix.startswith(fix)
     assert findings["lerobot"].status == "ok"
@@ -67,98 +66,90 @@ def test_wrong_or_missing_package_fails(
 @pytest.mark.parametrize(("version", "status"), [("0.6.1", "ok"), ("0.7.0", "warning"), ("0.8.0", "failed")])
 def test_untested_lerobot_is_named(installed: dict[str, str | None], version: str, status: str) -> None:
     installed["lerobot"] = version
-    found = next(finding for finding in examination.package_versions() if finding.what == "lerobot")
+    found = next(finding for finding in doctor.package_versions() if finding.what == "lerobot")
     assert (found.status, version in found.detail) == (status, True)
     assert ("not tested" in found.detail) == (status == "warning")
-    assert f"\nlerobot=={examination.RUN_WITH} " in (Path(__file__).parents[2] / "requirements.lock").read_text()
+    assert f"\nlerobot=={doctor.RUN_WITH} " in (Path(__file__).parents[1] / "requirements.lock").read_text()
 
 
 def test_overwritten_opencv_and_mujoco_are_warnings(installed: dict[str, str | None]) -> None:
-    assert examination.opencv().status == "ok"
+    assert doctor.opencv().status == "ok"
     installed["opencv-python"] = "5.0.0.93"
-    finding = examination.opencv()
+    finding = doctor.opencv()
     assert finding.status == "warning"
     assert finding.fix.startswith("pip uninstall -y opencv-python opencv-python-headless && pip install ")
-    lock = (Path(__file__).parents[2] / "requirements.lock").read_text()
+    lock = (Path(__file__).parents[1] / "requirements.lock").read_text()
     assert f"\nmujoco=={PUBLISHED_MUJOCO} " in lock
     installed |= {"mujoco": PUBLISHED_MUJOCO, "mujoco-core": None}
-    assert examination.physics().status == "ok"
+    assert doctor.physics().status == "ok"
     installed |= {"mujoco": "4.0.0", "mujoco-core": "4.0.0"}
-    assert PUBLISHED_MUJOCO in examination.physics().detail
+    assert PUBLISHED_MUJOCO in doctor.physics().detail
     installed["mujoco"] = "3.9.0"
-    assert (examination.physics().status, "mujoco-core" in examination.physics().fix) == ("warning", True)
+    assert (doctor.physics().status, "mujoco-core" in doctor.physics().fix) == ("warning", True)
 
 
 def test_missing_or_broken_plugin_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert examination.plugin().status == "ok"
+    assert doctor.plugin().status == "ok"
     real = builtins.__import__
 
     def broken(name: str, *args: Any) -> Any:
-        if name == examination.DISTRIBUTION:
+        if name == doctor.DISTRIBUTION:
             raise ImportError("no module named 'nonsense'")
         return real(name, *args)
 
     with monkeypatch.context() as patched:
         patched.setattr(builtins, "__import__", broken)
-        finding = examination.plugin()
+        finding = doctor.plugin()
     assert (finding.status, "nonsense" in finding.detail) == ("failed", True)
     monkeypatch.setattr(metadata, "distributions", list)
-    finding = examination.plugin()
+    finding = doctor.plugin()
     assert (finding.status, "make setup" in finding.fix) == ("failed", True)
 
 
 def test_a_copy_is_named_in_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "src" / examination.PACKAGE / "inner").mkdir(parents=True)
-    for folder in (tmp_path, tmp_path / "src" / examination.PACKAGE / "inner"):
+    (tmp_path / "src" / doctor.PACKAGE / "inner").mkdir(parents=True)
+    for folder in (tmp_path, tmp_path / "src" / doctor.PACKAGE / "inner"):
         monkeypatch.chdir(folder)
-        finding = examination.plugin()
+        finding = doctor.plugin()
         assert (finding.status, f"-e {tmp_path}" in finding.fix) == ("warning", True)
-    monkeypatch.chdir(Path(examination.__file__).parent)
-    assert examination.plugin().status == "ok"
+    monkeypatch.chdir(Path(doctor.__file__).parent)
+    assert doctor.plugin().status == "ok"
 
 
 def test_operating_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert examination.system().status in ("ok", "warning")
+    assert doctor.system().status in ("ok", "warning")
     with monkeypatch.context() as patched:
         patched.setattr(platform, "machine", lambda: "aarch64")
-        assert examination.system().status == "warning"
+        assert doctor.system().status == "warning"
     for name, status in (("darwin", "warning"), ("win32", "failed")):
         monkeypatch.setattr(sys, "platform", name)
-        finding = examination.system()
+        finding = doctor.system()
         assert (finding.status, bool(finding.fix)) == (status, True)
 
 
 def test_missing_video_decoder_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torchcodec.decoders", None)
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    for finding in (examination.torchcodec(), examination.ffmpeg()):
-        assert (finding.status, "ffmpeg" in finding.fix) == ("warning", True)
+    finding = doctor.video_decoding()
+    assert (finding.status, "ffmpeg" in finding.fix) == ("warning", True)
 
 
-def test_golden_frame_detects_wrong_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert examination.golden_frame().status == "ok"
-    golden = read_golden()
-    assert golden.shape == (SIDE, SIDE, 3)
-    grey = np.repeat(golden.mean(axis=2, keepdims=True), 3, axis=2).astype(np.uint8)
-    for wrong in (golden[::-1], golden[:, ::-1], golden[..., ::-1], grey, golden // 2):
-        assert difference(wrong, golden) > TOLERANCE
-    image = np.zeros((2 * SIDE, 2 * SIDE, 3), dtype=np.uint8)
-    image[::2] = 100
-    assert (shrink(image) == 50).all()
+def test_scene_that_cannot_be_drawn_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.picture().status == "ok"
 
-    def broken() -> np.ndarray:
+    def broken(*_: object) -> None:
         raise RuntimeError("no such scene")
 
-    for render in (lambda: np.zeros((SIDE, SIDE, 3), np.uint8), broken):
-        monkeypatch.setattr(examination, "render_golden", render)
-        finding = examination.golden_frame()
-        assert (finding.status, bool(finding.fix)) == ("failed", True)
+    monkeypatch.setattr(Simulation, "reset", broken)
+    finding = doctor.picture()
+    assert (finding.status, finding.detail, bool(finding.fix)) == ("failed", "RuntimeError: no such scene", True)
 
 
-def test_exit_status_and_table() -> None:
+def test_exit_status_and_table(monkeypatch: pytest.MonkeyPatch) -> None:
     findings = [Finding("a", "ok", "x"), Finding("b", "warning", "[y]", "do z")]
-    assert exit_status(findings) == 0
-    assert exit_status([*findings, Finding("c", "failed", "w", "v")]) == 1
+    for more, status in (([], 0), ([Finding("c", "failed", "w", "v")], 1)):
+        with monkeypatch.context() as patched:
+            patched.setattr(doctor, "examine", lambda found=[*findings, *more]: found)
+            assert memobench.main(["doctor", "--json"]) == status
     screen = console()
     with screen.capture() as capture:
         screen.print(finding_table(findings))
@@ -170,8 +161,8 @@ def test_exit_status_and_table() -> None:
 def test_caches_in_a_temporary_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "other"))
-    assert examination.caches().status == "ok"
+    assert doctor.caches().status == "ok"
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    found = examination.caches()
+    found = doctor.caches()
     assert (found.status, str(tmp_path / "cache") in found.detail) == ("warning", True)
     assert "XDG_CACHE_HOME" in found.fix

@@ -1,4 +1,4 @@
-"""Check the board: ``python -m lerobot_memobench.board BOARD [CHANGED [AUTHOR]]``, and print a digest of each row.
+"""Check the board: ``python -m tools.board BOARD [CHANGED [AUTHOR]]``, and print a digest of each row.
 
 CHANGED is a file with the paths that a pull request changes, separated by NUL (``git diff -z --name-only``). AUTHOR is
 the account of its author; of a maintainer, it is left out. The exit status is 1 where a submission is refused.
@@ -9,10 +9,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from lerobot_memobench.board.check import check_author, check_paths, read_board
 from lerobot_memobench.board.submission import BOARD
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.start import prepare_process
+from tools.board.check import check_author, check_paths, read_board
 
 
 def main(words: list[str]) -> int:

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.board.check import SEEDS, ranked, read_board
-from lerobot_memobench.board.submission import PAUSES, RERUNS, About, Submission
+from lerobot_memobench.board.rules import SEEDS
+from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.episode_log import INPUTS
 from lerobot_memobench.evaluation.comparison import Contrast, compare
 from lerobot_memobench.evaluation.evidence import Evidence
@@ -15,6 +15,8 @@ from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
 from lerobot_memobench.io import checked, parsed
 from lerobot_memobench.protocol import PAPER
+from tools.board.check import RERUNS, ranked, read_board
+from tools.board.submission import Submission
 
 
 @dataclass(frozen=True)

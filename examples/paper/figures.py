@@ -1,9 +1,9 @@
 """The paper's figures, from the JSON of a report: radar, correlations of process metrics with success, prefix curves.
 
-    memobench report mine=outputs/eval/k5 mine=outputs/eval/k20 --with paper --format json --out outputs/report
-    python examples/paper_figures.py outputs/report/report.json --out outputs/figures
+    memobench report mine=outputs/eval/k5 mine=outputs/eval/k20 --format json --out outputs/report
+    python examples/paper/figures.py outputs/report/report.json --out outputs/figures
 
-With ``--with paper`` the paper's rows are drawn as well; prefix curves are of the evaluations alone.
+The paper's rows are drawn as well; prefix curves are of the evaluations alone.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from published import published_rows
 
 from lerobot_memobench.evaluation.plots import (
     GRID,
@@ -30,7 +31,6 @@ from lerobot_memobench.evaluation.plots import (
     paper_style,
     save,
 )
-from lerobot_memobench.paper import LABELS
 
 METRICS = ("SR", "MSR", "MUR", "MCR")
 TYPE_LOOKS = {
@@ -61,11 +61,7 @@ def evaluations(report: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
 def rows_of(report: Mapping[str, Any], *tables: str) -> list[Row]:
     """Return the rows of the evaluations, then those of some of the paper's tables."""
     ours = [Row(each["method"], False, each["memory_types"], each["average"]) for each in evaluations(report).values()]
-    theirs = [
-        Row(LABELS.get(each["model"], each["model"]), True, each["memory_types"], each["average"])
-        for each in report.get("paper", ())
-        if each["table"] in tables
-    ]
+    theirs = [Row(row.label, True, row.memory_types, row.average) for row in published_rows(*tables)]
     return [*ours, *theirs]
 
 
@@ -210,9 +206,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/figures"), help="folder of the PDF and PNG files")
     chosen = parser.parse_args()
     report = json.loads(chosen.report.read_text())
-    radars = {"Main results": rows_of(report, "main")}
-    if "paper" in report:
-        radars["Memory alignment"] = rows_of(report, "alignment")
+    radars = {"Main results": rows_of(report, "main"), "Memory alignment": rows_of(report, "alignment")}
     figures = {
         "radar": draw_radar(radars),
         "correlations": draw_correlations(rows_of(report, "main")),

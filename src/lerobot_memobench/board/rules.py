@@ -1,0 +1,170 @@
+"""Rules of the board that an honest evaluation may break: settings, extent, versions, control, sealed seeds.
+
+`check_evaluation` and `check_control` need the evaluation's own files only.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from typing import Any
+
+from packaging.requirements import Requirement
+from packaging.version import InvalidVersion
+
+from lerobot_memobench.board.submission import PAUSES, Evaluation
+from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.envs.episode_log import POLICY, differences
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.agreement import disagreements
+from lerobot_memobench.protocol import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
+from lerobot_memobench.run.card import PACKAGES
+from lerobot_memobench.run.sealed import policy_hash, scenes_hash
+from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.task import LIBERO_SUITES
+
+FEWEST, MOST = 10, EVALUATION_EPISODES
+"""Episodes of each task, without evidence."""
+SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
+"""Seed of the first episode -> split of seeds that count."""
+MAY_DIFFER = {
+    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
+    *("evidence", "salt"),
+}
+"""Settings of the protocol that a submission may choose; all others have their defaults."""
+CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
+REQUIRED = {
+    found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
+}
+"""Package -> its versions under which this package runs."""
+
+
+def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") -> None:
+    """Check an evaluation: settings, episodes, seeds, versions, agreement of card and log.
+
+    Args:
+        part: whether any tasks of the suite, and any number of their episodes, are enough.
+        control: name of the control that it is, of `CONTROL_SETTING`.
+
+    Raises:
+        MemobenchError: naming the first rule that it breaks.
+    """
+    _check_settings(run, **CONTROL_SETTING.get(control, {}))
+    names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
+    _check_extent(run, names, 1 if part else FEWEST)
+    _check_versions(run, names)
+    if found := disagreements(run.card["episodes"], run.records):
+        raise MemobenchError(f"{run.place}: card and log disagree: {found[0]}; submit both unchanged")
+    _check_sealed(run)
+
+
+def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool = False) -> None:
+    """Check an evaluation of the same policy under a control, as `check_evaluation` does.
+
+    Raises:
+        MemobenchError: it breaks a rule, or has another policy or other settings.
+    """
+    check_evaluation(control, part=part, control=name)
+    for key in ("type", "sha256", "settings"):
+        mine, other = (each.card[POLICY].get(key) for each in (run, control))
+        if mine != other:
+            raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
+    if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
+        raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
+
+
+def _check_settings(run: Evaluation, **control: Any) -> None:
+    """Check that the settings are those of the board, and of a control."""
+    protocol = run.protocol
+    if protocol.get("suite") in LIBERO_SUITES:
+        raise MemobenchError(
+            f"{run.place}: found suite={protocol['suite']}; the board is of memory tasks, published or strict"
+        )
+    try:
+        board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
+    except (MemobenchError, TypeError) as error:
+        raise MemobenchError(f"{run.place}: {error}") from None
+    fixed = {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
+    if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
+        raise MemobenchError(
+            f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
+        )
+    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
+        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
+
+
+def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
+    """Check that the log holds each episode of each task once, from the first seed of a split on."""
+    protocol, seed = run.protocol, run.card[POLICY].get("seed")
+    count, base, most = protocol["episodes"], protocol["seed_base"], MOST
+    if protocol["evidence"]:  # whole scenes
+        fewest, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
+    if base not in list(SEEDS) or seed != base:
+        raise MemobenchError(
+            f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
+            "of the seeds that count"
+        )
+    if not fewest <= count <= most or sorted(protocol["tasks"]) != sorted(names):
+        raise MemobenchError(
+            f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
+            f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
+        )
+    asked = set(itertools.product(names, range(count)))
+    there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
+    for task, episode in sorted(asked ^ there)[:1]:
+        problem = "is missing in the log" if (task, episode) in asked else "is not part of the protocol"
+        raise MemobenchError(
+            f"{run.place}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
+            f"{len(names)} tasks"
+        )
+
+
+def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
+    """Check that one version ran all parts, with the task files of this version."""
+    for package in PACKAGES[:3]:
+        versions = {start["versions"].get(package) for start in run.card["runs"]}
+        if len(versions) > 1:
+            raise MemobenchError(
+                f"{run.place}: its parts ran under {package} {' and '.join(sorted(map(str, versions)))}; evaluate "
+                "again with one version"
+            )
+        for version in map(str, versions):
+            try:
+                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+            except InvalidVersion:
+                fits = False
+            if not fits:
+                raise MemobenchError(
+                    f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
+                )
+    for name in names:
+        here, there = task_hash(get_task(name)), run.card["task_files"].get(name)
+        if here != there:
+            raise MemobenchError(
+                f"{run.place}: the files of {name} have the hash {str(there)[:16]} on the card and {here} in this "
+                "version; evaluate with this version"
+            )
+
+
+def _check_sealed(run: Evaluation) -> None:
+    """Check that a sealed evaluation, and no other, has a salt, and was committed to its policy and scenes."""
+    is_sealed = SEEDS[run.protocol["seed_base"]] == SEALED
+    if is_sealed != bool(run.protocol["salt"]):
+        raise MemobenchError(
+            f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
+            "others: evaluate them by `memobench test-sealed`"
+        )
+    if not is_sealed:
+        return
+    sealed: Mapping[str, Any] = run.card.get("sealed", {})
+    release = run.card["runs"][0]["versions"].get(PACKAGES[0])
+    expected = {"scenes": scenes_hash(run.card), "policy": policy_hash(run.card), "release": release}
+    expected["run"] = len(sealed.get("earlier", ())) + 1
+    for key, value in expected.items():
+        if (there := sealed.get(key)) != value:
+            raise MemobenchError(
+                f"{run.place}: the commitment of the sealed test does not match ({key}: {str(there)[:12]} there, "
+                f"{str(value)[:12]} by the card); evaluate by `memobench test-sealed`"
+            )

@@ -1,0 +1,1 @@
+"""Programs of the project's maintainers, run from a checkout with ``python -m tools.<name>``."""
