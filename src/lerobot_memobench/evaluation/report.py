@@ -64,8 +64,13 @@ def write_report(directory: str | Path) -> Run:
     if run.missing is not None:
         figures["missing"] = run.missing
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
-    write_file(directory / REPORT_MARKDOWN, markdown(Report(headline([run]), [_section(run), *_evidence(run)])))
+    write_file(directory / REPORT_MARKDOWN, evaluation_markdown(run))
     return run
+
+
+def evaluation_markdown(run: Run) -> str:
+    """Return the report of one evaluation as Markdown."""
+    return markdown(Report(headline([run]), [_section(run), *_evidence(run)]))
 
 
 # --- documents ---
