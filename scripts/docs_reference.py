@@ -62,7 +62,7 @@ PUBLIC = {
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Difference compare"),
+    "Comparison": ("evaluation.comparison", "Comparison Contrast compare"),
     "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
