@@ -23,8 +23,10 @@ from lerobot_memobench.datasets.demonstration import Demonstration, digest, labe
 from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset, read_info, read_manifest
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.restore import ORIENTATIONS, restore, task_of
 from lerobot_memobench.datasets.validate import images_of, replay
 from lerobot_memobench.datasets.video import VideoWriter

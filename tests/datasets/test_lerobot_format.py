@@ -15,7 +15,8 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble, numeric_stats, write_dataset
 from lerobot_memobench.datasets.lerobot_format.card import _world, terms
-from lerobot_memobench.datasets.lerobot_format.layout import dataset_features, is_dataset
+from lerobot_memobench.datasets.lerobot_format.columns import dataset_features
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.staging import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms

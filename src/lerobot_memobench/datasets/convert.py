@@ -35,7 +35,8 @@ from lerobot_memobench.datasets.hdf5 import (
     unusable_on_error,
 )
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, Problem, check_destination
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING
+from lerobot_memobench.datasets.lerobot_format.manifest import Problem
 from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
 from lerobot_memobench.datasets.restore import (
     ORIENTATIONS,
@@ -47,6 +48,7 @@ from lerobot_memobench.datasets.restore import (
 from lerobot_memobench.datasets.staging import (
     EpisodeStage,
     StagedJob,
+    check_destination,
     episode_info,
     episodes_folder,
     finished_manifest,

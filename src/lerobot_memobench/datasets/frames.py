@@ -10,23 +10,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from torch import Tensor
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    OBJECTS,
-    check_clock,
-    naming_damage,
-    objects_column,
-    undamaged,
-    without_pattern,
-)
+from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
+from lerobot_memobench.datasets.lerobot_format.damage import naming_damage
+from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
+from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts, undamaged
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import files_below
-from lerobot_memobench.protocol import OBS_PHASE, PROMPT
+from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -80,65 +73,31 @@ def read_frame_table(root: Path) -> FrameTable:
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    table = _read_columns(root, [OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
+    wanted = {*_PLACE, *CLOCK, "phase", HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
+    table = read_table(root / "data", lambda name: EARLIER_COLUMNS.get(name, name) in wanted)
+    check_clock(table.column_names, root)
+    table = table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names]).sort_by("index")
     there = set(table.column_names)
+    number = {name: numbers(table.column(name)).reshape(-1) for name in {*_PLACE, OBS_PHASE, HELD_COLUMN} & there}
+    starts, expected = np.flatnonzero(number["frame_index"] == 0), np.arange(len(table))
+    episode = np.searchsorted(starts, expected, "right") - 1
+    if not (np.array_equal(number["index"], expected) and np.array_equal(number["episode_index"], episode)):
+        raise MemobenchError(
+            f"The frames of {root} are not numbered 0, 1, 2, ... episode by episode; write the dataset again."
+        )
     return FrameTable(
-        episodes=_episodes(root, table),
-        phase=(_numbers(table, OBS_PHASE) if OBS_PHASE in there else np.ones(len(table))).astype(np.uint8),
-        held=_numbers(table, HELD_COLUMN).astype(np.bool_) if HELD_COLUMN in there else np.zeros(len(table), np.bool_),
-        subgoals={level: _texts(table, name) for level, name in LEVEL_COLUMNS.items() if name in there},
-        memory=_texts(table, MEMORY_COLUMN) if MEMORY_COLUMN in there else None,
+        episodes=np.append(starts, len(table)).astype(np.int64),
+        phase=number.get(OBS_PHASE, np.ones(len(table))).astype(np.uint8),
+        held=number.get(HELD_COLUMN, np.zeros(len(table))).astype(np.bool_),
+        subgoals={level: texts(table.column(name)) for level, name in LEVEL_COLUMNS.items() if name in there},
+        memory=texts(table.column(MEMORY_COLUMN)) if MEMORY_COLUMN in there else None,
     )
 
 
 def holds_texts(root: Path, column: str) -> bool:
     """Return whether a column of texts exists and has a text that is not empty."""
-    for path in files_below(root / "data", ".parquet"):
-        for name in pq.read_schema(path).names:
-            if EARLIER_COLUMNS.get(name, name) == column and any(_texts(pq.read_table(path, columns=[name]), name)):
-                return True
-    return False
-
-
-def _read_columns(root: Path, optional: list[str]) -> pa.Table:
-    """Return each frame's indices, and the existing ones among the optional columns."""
-    files = files_below(root / "data", ".parquet")
-    if not files:
-        raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
-    with undamaged(files[0]):
-        present = pq.read_schema(files[0]).names
-    check_clock(present, root)
-    own = {EARLIER_COLUMNS.get(name, name): name for name in present}
-    kept = {name: own[name] for name in (*_PLACE, *optional) if name in own}
-    tables = []
-    for path in files:
-        with undamaged(path):
-            tables.append(pq.read_table(path, columns=[*kept.values()]))
-    table = pa.concat_tables(tables, promote_options="permissive").sort_by("index")
-    return table.rename_columns([*kept])
-
-
-def _episodes(root: Path, table: pa.Table) -> np.ndarray:
-    index, episode, frame = (_numbers(table, name) for name in _PLACE)
-    starts = np.flatnonzero(frame == 0)
-    expected = np.arange(len(index))
-    if not np.array_equal(index, expected) or not np.array_equal(
-        episode, np.searchsorted(starts, expected, "right") - 1
-    ):
-        raise MemobenchError(
-            f"The frames of {root} are not numbered 0, 1, 2, ... episode by episode; write the dataset again."
-        )
-    return np.append(starts, len(index)).astype(np.int64)
-
-
-def _numbers(table: pa.Table, name: str) -> np.ndarray:
-    return np.asarray(table.column(name).to_pylist()).reshape(-1)
-
-
-def _texts(table: pa.Table, name: str) -> list[str]:
-    """Return a column of texts. Rows are strings or lists of one string; a missing one is empty."""
-    values = table.column(name).to_pylist()
-    return [(value[0] if isinstance(value, list) else value) or "" for value in values]
+    tables = tables_of(root / "data", lambda name: EARLIER_COLUMNS.get(name, name) == column)
+    return any(any(texts(one)) for _, table in tables for one in table.columns)
 
 
 def resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
@@ -328,11 +287,10 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
         MemobenchError: a column is missing, or frames are not numbered 0, 1, 2, ...
     """
     table = read_frame_table(root)
-    frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
-    for path in files_below(root / "data", ".parquet"):
-        with undamaged(path):
-            there = pq.read_schema(path).names
+    wanted = {"index", *names} | ({PRIVILEGED} if OBJECTS in names else set())
+    for _, part in tables_of(root / "data", wanted.__contains__):
+        there = part.column_names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
         missing = [name for name in column_of.values() if name not in there]
         if missing:
@@ -340,21 +298,12 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
                 f"The dataset {root} has no column '{missing[0]}', which this policy learns from; generate it again "
                 "with this version, or train with --policy.perception=pixels and no --policy.detection_noise."
             )
-        with undamaged(path):
-            part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
         places = part.column("index").to_numpy()
-        for name in names:
-            numbers = _column_numbers(part.column(column_of[name]))
-            column = columns.setdefault(name, np.empty((frames, *numbers.shape[1:]), numbers.dtype))
-            column[places] = numbers
+        for name, given in column_of.items():
+            values = numbers(part.column(given))
+            column = columns.setdefault(name, np.empty((len(table.phase), *values.shape[1:]), values.dtype))
+            column[places] = values
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
-
-
-def _column_numbers(column: pa.ChunkedArray) -> np.ndarray:
-    """Return numbers (n,), or (n, d) of a column of lists of one length."""
-    if not (pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)):
-        return np.asarray(column.to_numpy())
-    return np.asarray(column.combine_chunks().flatten().to_numpy(zero_copy_only=False)).reshape(len(column), -1)
 
 
 # --- images ---

@@ -31,10 +31,12 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, is_dataset, read_manifest
+from lerobot_memobench.datasets.lerobot_format.damage import check_whole
+from lerobot_memobench.datasets.lerobot_format.layout import STAGING, TOP_LEVEL, is_dataset
+from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, write_file
+from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
@@ -314,6 +316,23 @@ def flush_to_disk(paths: Iterable[Path]) -> None:
 
 
 # --- the run ---
+
+
+def check_destination(out: Path) -> None:
+    """Raise unless ``out`` is absent, empty, or holds only an unfinished run."""
+    if is_dataset(out):
+        raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    refuse_links(*(out / name for name in (STAGING, *TOP_LEVEL)))
+    # Files of an interrupted move next to the staging folder are replaced.
+    strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
+    if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
+        raise MemobenchError(
+            f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
+        )
 
 
 @contextlib.contextmanager

@@ -20,27 +20,25 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, digest, labels, persistent_rows
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.lerobot_format.columns import (
+    EXECUTED_ACTION,
+    LANGUAGE,
+    OBJECTS,
+    check_clock,
+    image_key,
+    objects_column,
+)
+from lerobot_memobench.datasets.lerobot_format.damage import check_whole, expect, read_to_end
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
-    EXECUTED_ACTION,
+    EPISODES,
     INFO_FILE,
-    LANGUAGE,
     MANIFEST_FILE,
-    OBJECTS,
     STATS_FILE,
-    Written,
-    check_clock,
-    check_whole,
     dataset_files,
-    episode_count,
-    expect,
-    image_key,
     is_dataset,
-    objects_column,
-    read_info,
-    read_manifest,
-    read_to_end,
 )
+from lerobot_memobench.datasets.lerobot_format.manifest import Written, read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import (
     Columns,
     EpisodePlace,
@@ -49,10 +47,11 @@ from lerobot_memobench.datasets.lerobot_format.reading import (
     list_episodes,
     read_episode,
 )
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, read_table
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
-from lerobot_memobench.io import check_fetched, cut, file_hash, files_below, refusing
+from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
@@ -238,6 +237,20 @@ def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) 
 
 
 # --- files ---
+
+
+def episode_count(folder: Path) -> int:
+    """Return the number of episodes of the dataset in ``folder``, by ``meta/info.json`` and ``meta/episodes``.
+
+    Raises:
+        MemobenchError: they cannot be read, or disagree.
+    """
+    count, rows = int(read_info(folder)["total_episodes"]), len(read_table(folder / EPISODES, "episode_index".__eq__))
+    if rows != count:
+        raise MemobenchError(
+            f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
+        )
+    return count
 
 
 def check_file(path: Path, written: Written | None) -> str | None:

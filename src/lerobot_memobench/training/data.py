@@ -28,8 +28,10 @@ from lerobot_memobench.datasets.frames import (
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
+from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
+from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of

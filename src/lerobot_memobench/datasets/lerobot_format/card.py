@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from huggingface_hub import DatasetCardData
 
-from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamaged
+from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, undamaged
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import files_below
@@ -52,33 +53,6 @@ LIMITATIONS = """\
   for memory.
 - Visible objects, states, seeds and checkpoint columns come from the simulator and are not visible to cameras.
 - Frames of demonstration prompts show the information to remember, not the actions to take."""
-COLUMNS = {
-    "observation.images.image": "third-person camera",
-    **{f"observation.images.{name}": "wrist camera" for name in ("wrist_image", "image2")},
-    "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
-    "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
-    "observation.environment_state": "objects visible to the cameras, 16 slots: see `memobench objects`",
-    "privileged.environment_state": "the same in datasets with images: true poses, which LeRobot's own training does "
-    "not use as an input; `memobench_mem` with `perception=objects` reads them, others with `lerobot train "
-    "obs_type=both`",
-    "executed_action": "the applied action; differs from `action` where the arm was perturbed (`generate --perturb`)",
-    "observation.phase": "0 demonstration prompt and the rest after it (the policy does not act), 1 execution",
-    "observation.step": "control steps since that phase began; -1 in the execution of strict tasks",
-    "held": "the scene of a strict task is held at home in the execution: the action, zeros, has no effect",
-    "checkpoint.index": "number of checkpoints completed in order before this frame",
-    "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
-    "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
-    "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
-    "subgoal.coarse": "the state that the present checkpoint reaches; after the last checkpoint its text remains",
-    "subgoal.intermediate": "the event of the present checkpoint, in the past tense",
-    "subgoal.fine": "the same in more detail, in the past tense",
-    "subgoal.instruction": "the intermediate text as an instruction, in the present tense",
-    "oracle_memory": "the intermediate texts of the checkpoints completed in order so far; empty at the start",
-    "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, the next step as an "
-    "instruction; style `memory`, the completed steps",
-    "episode_info": "JSON at an episode's first frame, else empty: the fields of the table below, and versions, "
-    "because LeRobot's dataset tools keep only columns of frames",
-}
 EPISODE_COLUMNS = {
     "task_name": "task of the catalogue",
     "memory_type": "temporal, spatial, object or procedural",
@@ -275,7 +249,7 @@ def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
         ),
         markdown(
             ["column", "type", "meaning"],
-            [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
+            [[f"`{key}`", _type(ft), MEANINGS[key]] for key, ft in features.items() if key in MEANINGS],
         ),
         "Further columns are LeRobot's own: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
         "`task_index`.",

@@ -16,23 +16,25 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.lerobot_format.columns import (
     EPISODE_INFO,
-    EXECUTED_ACTION,
     LANGUAGE,
-    OBJECTS,
-    PRIVILEGED,
-    is_dataset,
+)
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODES, is_dataset
+from lerobot_memobench.datasets.lerobot_format.tables import (
+    is_numeric,
+    numbers,
     read_info,
-    undamaged,
+    read_table,
+    read_tasks,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, files_below, first_fault, parsed
+from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    pass
 
 Columns = dict[str, Any]
 STRANGER = (
@@ -169,7 +171,8 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
     """
     read_info(folder)
     rows = _rows(folder)
-    first = _read(folder / "data", ("episode_index", EPISODE_INFO), [("frame_index", "==", 0)]).to_pylist()
+    own = ("episode_index", EPISODE_INFO)
+    first = read_table(folder / "data", own.__contains__, [("frame_index", "==", 0)]).to_pylist()
     texts = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
     return [_place(folder, row, texts.get(row["episode_index"])) for row in rows]
 
@@ -283,7 +286,6 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
             raise MemobenchError(
                 f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
             )
-    _name_tasks(root, columns)
     return RecordedEpisode(
         record.task_name,
         record.variant,
@@ -313,21 +315,11 @@ def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | 
         raise MemobenchError(f"meta/episodes has length={row['length']}, but it has {length} frames")
 
 
-def _name_tasks(root: Path, columns: Columns) -> None:
-    """Replace the number of each frame's instruction by the instruction, as ``task``."""
-    from lerobot.datasets.io_utils import load_tasks
-
-    with undamaged(root / "meta" / "tasks.parquet"):
-        tasks = load_tasks(root)
-    names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
-    columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
-
-
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
     """Return the rows of meta/episodes, or that of one episode, in order and without statistics."""
     own = ("episode_index", "length", "dataset_from_index", "tasks", *EpisodeRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
-    return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
+    return read_table(folder / EPISODES, own.__contains__, chosen).sort_by("episode_index").to_pylist()
 
 
 def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
@@ -337,35 +329,18 @@ def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
     return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record, instructions)
 
 
-def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, str, int]] | None) -> pa.Table:
-    """Return the existing ones among the columns (None: all) of all files; files of merged datasets may differ."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    tables = []
-    for path in files_below(folder, ".parquet"):
-        with undamaged(path):
-            there = pq.read_schema(path).names
-            columns = None if names is None else [name for name in names if name in there]
-            tables.append(pq.read_table(path, columns=columns, filters=chosen))
-    if not tables:
-        raise MemobenchError(f"{folder} holds no parquet file: the dataset is incomplete; fetch or generate it again")
-    return pa.concat_tables(tables, promote_options="permissive")
-
-
 def _read_columns(root: Path, episode_index: int) -> Columns:
-    """Return the columns of an episode's frames and, if stored, its states."""
+    """Return the columns of an episode's frames, its instructions as ``task``, and, if stored, its states."""
     chosen = [("episode_index", "==", episode_index)]
-    table = _read(root / "data", None, chosen).sort_by("frame_index")
+    table = read_table(root / "data", rows=chosen).sort_by("frame_index")
     columns: Columns = {}
-    for name in table.column_names:
-        values = table.column(name).to_pylist()
-        is_text = name == LANGUAGE or isinstance(values[0], str)
-        columns[EARLIER_COLUMNS.get(name, name)] = values if is_text else np.array(values)
-    for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS, PRIVILEGED):
-        if name in columns:
-            columns[name] = columns[name].astype(np.float32)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        values = numbers(column) if is_numeric(column.type) else column.to_pylist()
+        columns[EARLIER_COLUMNS.get(name, name)] = values
+    tasks = read_tasks(root)
+    names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
+    columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
     if (root / "states").is_dir():
-        states = _read(root / "states", None, chosen).sort_by("frame_index")
-        columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
+        states = read_table(root / "states", rows=chosen).sort_by("frame_index")
+        columns["states"] = numbers(states.column("state"))
     return columns

@@ -19,7 +19,7 @@ from torch import nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from lerobot_memobench.datasets.lerobot_format.layout import PRIVILEGED
+from lerobot_memobench.datasets.lerobot_format.columns import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
