@@ -275,8 +275,8 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
-    from lerobot_memobench.datasets.lerobot_format.card import EPISODE_COLUMNS
     from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
+    from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
@@ -293,7 +293,7 @@ def dataset_page() -> str:
         "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EPISODE_COLUMNS.items()]),
+        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EpisodeRecord.meanings().items()]),
     ]
     return "\n\n".join(parts) + "\n"
 

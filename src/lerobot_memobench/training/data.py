@@ -1,4 +1,4 @@
-"""Open the data of a training: datasets, the lookup of their frames, samples and processors."""
+"""Open the data of a training: datasets, the lookup of their frames, and processors."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from lerobot_memobench.policies.memobench_mem.targets import with_targets
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
-from lerobot_memobench.training.sampler import seed_of
+from lerobot_memobench.training.samples import DecodedSamples, SamplesInMemory
 
 logger = logging.getLogger(__name__)
 
@@ -87,7 +87,8 @@ class Training:
         chunk = self.policy.config.action_delta_indices
         if not self.lookup.columns:
             return DecodedSamples(dataset, self.lookup, chunk, self.seed)
-        return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), chunk)
+        tasks = dataset.meta.tasks.index.tolist()
+        return SamplesInMemory(self.lookup.columns, self.lookup.runs, {ACTION: chunk}, tasks)  # chunks end at a hold
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
@@ -247,50 +248,6 @@ def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
     name = "words" if config.align == "none" else config.text_encoder
     assert name is not None  # the configuration sets it
     return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
-
-
-# -- samples -----------------------------------------------------------------------------------------------------------
-
-
-class RecordedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, from columns in main memory, without pictures.
-
-    Chunks end at a hold as at the end of an episode.
-
-    Args:
-        chunk: steps of a sample's actions, relative to its frame.
-    """
-
-    def __init__(self, lookup: FrameLookup, tasks: Sequence[str], chunk: Sequence[int]) -> None:
-        self._lookup, self._tasks, self._chunk = lookup, tasks, torch.tensor([*chunk])
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        lookup = self._lookup
-        first, end = lookup.run_of(index)
-        found: dict[str, Any] = {name: column[index] for name, column in lookup.columns.items()}
-        wanted = index + self._chunk
-        found[ACTION] = lookup.columns[ACTION][wanted.clamp(first, end - 1)]
-        found[f"{ACTION}_is_pad"] = (wanted < first) | (wanted >= end)
-        return found | {"task": self._tasks[int(found["task_index"])]}
-
-
-class DecodedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, pictures included; actions of a chunk after a hold are padding.
-
-    With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
-    """
-
-    def __init__(self, dataset: LeRobotDataset, lookup: FrameLookup, chunk: Sequence[int], seed: int) -> None:
-        self._dataset, self._seed, self._row = dataset, seed, dataset.absolute_to_relative_idx
-        self._lookup, self._chunk = lookup, torch.tensor([*chunk])
-
-    def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
-        index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed_of(self._seed, number, 0, 0))
-            found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
-        found[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
-        return found
 
 
 # -- processors --------------------------------------------------------------------------------------------------------

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from huggingface_hub import DatasetCardData
+from huggingface_hub import DatasetCard, DatasetCardData
 
 from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, EpisodeRecord, list_episodes
 from lerobot_memobench.datasets.lerobot_format.tables import read_info, undamaged
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
@@ -45,30 +45,6 @@ AUTHORS_TERMS = (
     "Collab-Gen/MEMOBench; their paper announces CC BY 4.0 for the data. Unless they say otherwise, use this dataset "
     "for research that is not commercial, and name them (Sun et al.)."
 )
-LIMITATIONS = """\
-- One simulated kitchen, one Panda arm and one scripted expert: each task is done in one way and has one instruction.
-  Transfer to real images is untested.
-- In tasks with a demonstration prompt the texts of subgoals, memory and language rows name information that only the
-  prompt shows: the carton, the bowl, the drawer or the order. A policy that reads them during execution is not tested
-  for memory.
-- Visible objects, states, seeds and checkpoint columns come from the simulator and are not visible to cameras.
-- Frames of demonstration prompts show the information to remember, not the actions to take."""
-EPISODE_COLUMNS = {
-    "task_name": "task of the catalogue",
-    "memory_type": "temporal, spatial, object or procedural",
-    "family": "group of similar tasks",
-    "operations": "labels of the checkpoints in order, e.g. SUC",
-    "seed": "seed of the scene",
-    "referent": "fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it (strict tasks)",
-    "variant": "number of the referent or order; 0 is the published one",
-    "success": "the goal was reached",
-    "exec_start_index": "first frame of the execution",
-    "key_frames": "frame at which each checkpoint was completed in order, −1 if never",
-    "scene_hash": "hash of the initial scene",
-    "fixture_poses": "JSON, fixture to position and quaternion wxyz",
-    "digest": "sha256 of states, actions and labels",
-}
-
 
 FAMILIES: dict[str, dict[str, Any]] = {name: raw_tables()["demo_statistics"][name] for name in (*MEMORY_TYPES, "total")}
 """Rows of the paper's appendix, "Family level statistics"; ``gib``: size of its HDF5 files."""
@@ -100,7 +76,7 @@ def write_card(
     if left_out:
         made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {problem}" for problem in left_out))
     infos = [episode.info for episode in solved]
-    text = _card(infos, failed, features, _size(folder), made, _loading(repo_id, "<this folder>"))
+    text = _card(infos, failed, features, _size(folder), made, f'"{repo_id}", root="<this folder>"')
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -122,8 +98,8 @@ def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: s
         repo_id: its address on the hub; None if it is loaded from a folder.
     """
     infos = [{**row, "frames": row["length"]} for row in rows]
-    loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
-    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], loading)
+    location = f'"{repo_id}"' if repo_id else '"local/demonstrations", root="<this folder>"'
+    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], location)
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
@@ -158,7 +134,7 @@ def _card(
     features: Mapping[str, dict[str, Any]],
     size: int,
     made: Sequence[str],
-    loading: str,
+    location: str,
 ) -> str:
     """Return the card.
 
@@ -168,7 +144,7 @@ def _card(
         features: columns of the dataset.
         size: bytes of the dataset.
         made: paragraphs on its making.
-        loading: code that loads it.
+        location: arguments of ``LeRobotDataset`` that load it.
     """
     licence, section = terms(infos)
     data = DatasetCardData(
@@ -179,87 +155,29 @@ def _card(
         size_categories=["n<1K" if len(infos) < 1000 else "1K<n<10K"],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
-    parts = [
-        f"---\n{data.to_yaml()}\n---",
-        "# MEMOBench demonstrations",
-        *_introduction(infos, loading),
-        MADE_BY,
-        *made,
-        *_statistics(infos, failed, size),
-        "## Columns",
-        *_columns(features),
-        "## Limitations",
-        LIMITATIONS,
-        "## Licence",
-        section,
-    ]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _loading(repo_id: str, root: str | None) -> str:
-    """Return code that loads the dataset from a folder, or from the hub."""
-    where = f'"{repo_id}"' if root is None else f'"{repo_id}", root="{root}"'
-    return f"""\
-```python
-from torch.utils.data import Subset
-from lerobot.datasets import LeRobotDataset
-
-dataset = LeRobotDataset({where})
-frames = zip(dataset.hf_dataset["observation.phase"], dataset.hf_dataset["held"])
-execution = Subset(dataset, [i for i, (phase, held) in enumerate(frames) if phase == 1 and not held])
-```"""
-
-
-def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]:
-    tasks = {info["task_name"] for info in infos}
-    return [
-        f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
-        f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task has "
-        "checkpoints that a memory must store (Storage), revise (Update) or summarise (Compression); the simulator "
-        "labels each frame with the completed ones. Benchmark and metrics: MEMOBench; generator, environment and "
-        "policies: `lerobot_memobench`.",
-        *_world(infos),
-        loading,
-        "`execution` leaves out the frames of demonstration prompts and held frames, in which the policy does not act, "
-        "as `lerobot train` of `lerobot_memobench` does; an action chunk ends where the next held frame begins. To "
-        "load one memory type, use `episode_filter=lambda episode: "
-        'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to your own '
-        "DataLoader, as `lerobot-train` does: the number of language rows differs between episodes.",
-    ]
-
-
-SCENES = "The scenes are made of LIBERO's assets."
-
-
-def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a paragraph on the source of the scenes."""
-    missing = sorted({name for info in infos for name in info.get("stand_ins") or ()})
-    stand_ins = f" This package's objects replace missing scans: {', '.join(missing)}." if missing else ""
-    former = any(info.get(WORLD) != LIBERO for info in infos)
-    return ["The scenes are those that version 0.2 modelled in code." if former else f"{SCENES}{stand_ins}"]
-
-
-def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
-    convention = convention_of(features)
-    return [
-        *(
-            [f"Images have `convention={convention}`; with `libero` they are mirrored left to right."]
-            if convention
-            else []
-        ),
-        markdown(
-            ["column", "type", "meaning"],
-            [[f"`{key}`", _type(ft), MEANINGS[key]] for key, ft in features.items() if key in MEANINGS],
-        ),
-        "Further columns are LeRobot's own: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
-        "`task_index`.",
-        "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
-        'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
-        markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
-        "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
-        "numbers are exact over all frames that are not held, those of images over sampled frames. `observation.phase` "
-        "and `observation.step` have none, so that LeRobot does not normalise them and they are as in a rollout.",
-    ]
+    total = _figures(infos)
+    shown = [[f"`{key}`", _type(ft), MEANINGS[key]] for key, ft in features.items() if key in MEANINGS]
+    described = EpisodeRecord.meanings().items()
+    card = DatasetCard.from_template(
+        data,
+        str(Path(__file__).with_name("card.md")),
+        total=total,
+        types=ordered_types(infos),
+        former=any(info.get(WORLD) != LIBERO for info in infos),
+        stand_ins=sorted({name for info in infos for name in info.get("stand_ins") or ()}),
+        location=location,
+        made=[paragraph for paragraph in made if paragraph],
+        lengths=_lengths_table(infos),
+        bytes_per_frame=f"{size / total['steps']:,.0f}",
+        prompts=_prompts(infos),
+        buckets=_buckets_table(infos),
+        tasks=_tasks_table(infos, failed),
+        convention=convention_of(features),
+        columns=markdown(["column", "type", "meaning"], shown),
+        episode_columns=markdown(["column", "meaning"], [[f"`{key}`", text] for key, text in described]),
+        licence=section,
+    )
+    return f"{card}\n"
 
 
 def _type(feature: dict[str, Any]) -> str:
@@ -308,27 +226,14 @@ def _shows_scans(info: Mapping[str, Any]) -> bool:
 # --- statistics, and the paper's ---
 
 
-def _statistics(written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], size: int) -> list[str]:
-    return [
-        "## Statistics",
-        "Steps are frames: control steps of 50 ms, demonstration prompt included. The paper's rows are those of its "
-        "demonstrations (appendix, family level statistics).",
-        _lengths_table(written),
-        f"{size / sum(info['frames'] for info in written):,.0f} bytes per frame.",
-        _prompts(written),
-        "Number of episodes by length, in steps (paper: appendix, distribution of lengths):",
-        _buckets_table(written),
-        _tasks_table(written, failed),
-    ]
-
-
-def _prompts(infos: Sequence[dict[str, Any]]) -> str:
+def _prompts(infos: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the mean length of prompts for each memory type that has some."""
     parts = []
     for name in ordered_types(infos):
         lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
-    return f"The demonstration prompt takes, on average, {' and '.join(parts)} of these steps." if parts else ""
+    return parts
 
 
 def _size(folder: Path) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN
 from lerobot_memobench.datasets.lerobot_format.columns import (
@@ -65,11 +65,11 @@ class EpisodeRecord(BaseModel):
     the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
     keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files.
 
+    A field's description is its meaning in the dataset card.
+
     Attributes:
-        seed: seed of the scene; -1 if unknown.
-        key_frames: one per checkpoint, -1 if it was not completed.
-        fixture_poses: fixture to position and quaternion wxyz.
-        digest: sha256 of states, actions and labels; None in datasets of earlier versions.
+        seed: -1 if unknown.
+        digest: None in datasets of earlier versions.
         world: ``libero``; None for the scenes that version 0.2 modelled in code, as for stand_ins.
         stand_ins: classes whose missing scans this package's objects replaced.
         versions: versions of the packages on which the numbers depend; None if unknown.
@@ -77,22 +77,33 @@ class EpisodeRecord(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    task_name: str
-    memory_type: str
-    family: str = ""
-    operations: str = ""
-    seed: Whole
-    referent: str = "fixed"
-    variant: Count
-    success: bool | None = None
-    exec_start_index: Count
-    key_frames: list[Whole]
-    scene_hash: str | None = None
-    fixture_poses: dict[str, list[Number]] | None = None
-    digest: str | None = None
+    task_name: str = Field(description="task of the catalogue")
+    memory_type: str = Field(description="temporal, spatial, object or procedural")
+    family: str = Field("", description="group of similar tasks")
+    operations: str = Field("", description="labels of the checkpoints in order, e.g. SUC")
+    seed: Whole = Field(description="seed of the scene")
+    referent: str = Field(
+        "fixed",
+        description="fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it "
+        "(strict tasks)",
+    )
+    variant: Count = Field(description="number of the referent or order; 0 is the published one")
+    success: bool | None = Field(None, description="the goal was reached")
+    exec_start_index: Count = Field(description="first frame of the execution")
+    key_frames: list[Whole] = Field(description="frame at which each checkpoint was completed in order, −1 if never")
+    scene_hash: str | None = Field(None, description="hash of the initial scene")
+    fixture_poses: dict[str, list[Number]] | None = Field(
+        None, description="JSON, fixture to position and quaternion wxyz"
+    )
+    digest: str | None = Field(None, description="sha256 of states, actions and labels")
     world: str | None = None
     stand_ins: list[str] | None = None
     versions: dict[str, str] | None = None
+
+    @classmethod
+    def meanings(cls) -> dict[str, str]:
+        """Return the described fields and their descriptions."""
+        return {name: field.description for name, field in cls.model_fields.items() if field.description}
 
     def in_frames(self) -> str:
         """Return the text of the first frame's column."""
