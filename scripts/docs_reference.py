@@ -276,7 +276,7 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
     from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
-    from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+    from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}

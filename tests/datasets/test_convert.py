@@ -477,7 +477,7 @@ def test_bad_archives(written, tmp_path, monkeypatch, capsys):
     for name in [*names, "cut.hdf5"]:
         (line,) = [line for line in out.splitlines() if line.startswith(f"left out: {name.replace(chr(10), '?')}: ")]
         assert ("cannot be unpacked" if name == "cut.hdf5" else "names no file") in line
-    assert read_episode(tmp_path / "ds", 1).task_name == BUTTER
+    assert read_episode(tmp_path / "ds", 1).record.task_name == BUTTER
     (tmp_path / "cut.zip").write_bytes(source.read_bytes()[:-100])
     with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
         archive.writestr("README.md", "about an empty archive")

@@ -163,7 +163,7 @@ def test_terms_depend_on_scans_and_source(demos, make_task, tmp_path):
         ("converted", replace(demos[0], seed=-1), "cc-by-nc-4.0"),
     ):
         root = write_dataset([demo], tmp_path / folder)
-        assert read_episode(root, 0).world == LIBERO
+        assert read_episode(root, 0).record.world == LIBERO
         (row,) = json.loads((root / "manifest.json").read_text())["episodes"]
         assert (row["world"], row["stand_ins"]) == (LIBERO, list(demo.stand_ins))
         card = DatasetCard.load(root / "README.md")

@@ -37,7 +37,7 @@ from lerobot_memobench.datasets.hdf5 import (
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
 from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.lerobot_format.manifest import Problem
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.restore import (
     ORIENTATIONS,
     orientation_of,
@@ -49,7 +49,6 @@ from lerobot_memobench.datasets.staging import (
     EpisodeStage,
     StagedJob,
     check_destination,
-    episode_info,
     episodes_folder,
     finished_manifest,
     stage_failure,
@@ -486,5 +485,5 @@ class ConversionJob(StagedJob):
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
             demo = restore(task_of(file, found), found)
-            EpisodeRecord.model_validate(episode_info(demo))  # a bad value ends this episode, not the assembly of all
+            EpisodeRecord.of(demo)  # a bad value ends this episode, not the assembly of all
             return demo

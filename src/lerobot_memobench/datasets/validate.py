@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, digest, labels, persistent_rows
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
 from lerobot_memobench.datasets.frames import FrameReader, frame_reader
 from lerobot_memobench.datasets.lerobot_format.columns import (
     EXECUTED_ACTION,
@@ -47,6 +47,7 @@ from lerobot_memobench.datasets.lerobot_format.reading import (
     list_episodes,
     read_episode,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import read_info, read_table
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
@@ -229,9 +230,9 @@ def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Che
 
 def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) -> str | None:
     episode = read_episode(folder, index)
-    if episode.seed < 0:
+    if episode.record.seed < 0:
         return "it has no seed, so its scene cannot be made again"
-    task, images = (tasks or {}).get(episode.task_name), images_of(folder, index)
+    task, images = (tasks or {}).get(episode.record.task_name), images_of(folder, index)
     found = replay(episode, task=task, images=images)
     return None if found is None else str(found)
 
@@ -379,19 +380,21 @@ def replay(
         MemobenchError: there is no such task, or the actions were removed.
     """
     if isinstance(recorded, Demonstration):
-        task, start, wanted, executed, held = recorded.task, 0, recorded.actions, recorded.applied, recorded.held
+        record, task, start = EpisodeRecord.of(recorded), recorded.task, 0
+        wanted, executed, held = recorded.actions, recorded.applied, recorded.held
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
-        check_world(recorded.world, "the episode")
-        task, start = (task or get_task(recorded.task_name)).variant(recorded.variant), recorded.start
+        record, start = recorded.record, recorded.start
+        check_world(record.world, "the episode")
+        task = (task or get_task(record.task_name)).variant(record.variant)
         columns, whole = recorded.columns, recorded.whole
         if "action" not in columns:
             raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
         wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
         held = columns.get(HELD_COLUMN)
-    watch = _ImageCheck(recorded.exec_start, len(wanted), images)
-    again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch, held)
-    again = replace(again, referent=recorded.referent, variant=recorded.variant)
+    watch = _ImageCheck(record.exec_start_index, len(wanted), images)
+    again = resimulate(task, record.seed, executed, record.exec_start_index, watch, held)
+    again = replace(again, referent=record.referent, variant=record.variant)
     if not np.array_equal(wanted, executed):
         again = replace(again, actions=wanted, executed=again.actions)
     found = _whole_difference(whole, _whole(again))
@@ -519,18 +522,7 @@ def _columns(demo: Demonstration, objects: str) -> Columns:
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:
-    found = labels(demo)
-    return {
-        "memory_type": demo.task.memory_type,
-        "family": demo.task.family,
-        "operations": demo.task.operations,
-        "success": demo.success,
-        "key_frames": found.key_frames.tolist(),
-        "scene_hash": demo.scene_hash,
-        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
-        "language_persistent": persistent_rows(found),
-        "digest": digest(demo),
-    }
+    return EpisodeRecord.of(demo).determined() | {LANGUAGE: persistent_rows(labels(demo))}
 
 
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:

@@ -34,7 +34,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import (
     dataset_files,
 )
 from lerobot_memobench.datasets.lerobot_format.manifest import Written
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.staging import (
     TEMPORARY,
     StagedEpisode,

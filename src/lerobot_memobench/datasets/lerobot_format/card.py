@@ -11,7 +11,8 @@ import numpy as np
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, EpisodeRecord, list_episodes
+from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.lerobot_format.tables import read_info, undamaged
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError

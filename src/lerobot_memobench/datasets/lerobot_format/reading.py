@@ -1,19 +1,17 @@
-"""Read a dataset of this package: the record of each episode, and an episode's frames.
+"""Read episodes of a dataset: the record of each, and an episode's frames.
 
 LeRobot's dataset tools may have edited it; the records are then read from the frames (`EpisodeRecord`).
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN
 from lerobot_memobench.datasets.lerobot_format.columns import (
@@ -21,6 +19,7 @@ from lerobot_memobench.datasets.lerobot_format.columns import (
     LANGUAGE,
 )
 from lerobot_memobench.datasets.lerobot_format.layout import EPISODES, is_dataset
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord, from_frames, from_meta
 from lerobot_memobench.datasets.lerobot_format.tables import (
     is_numeric,
     numbers,
@@ -29,7 +28,6 @@ from lerobot_memobench.datasets.lerobot_format.tables import (
     read_tasks,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import STRICT
 
@@ -42,117 +40,6 @@ STRANGER = (
     f"without the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
 )
 """Message for an episode without a record."""
-WHOLE = {
-    "memory_type",
-    "family",
-    "operations",
-    "success",
-    "key_frames",
-    "scene_hash",
-    "fixture_poses",
-    "digest",
-}
-"""Fields of a record that are determined by task, seed and actions."""
-
-
-# --- the record of an episode ---
-
-
-class EpisodeRecord(BaseModel):
-    """Fields of an episode as a whole: its task, seed, placement, hashes.
-
-    A dataset stores it twice: in ``meta/episodes``, which ``LeRobotDataset(…, episode_filter=…)`` reads, and as JSON in
-    the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
-    keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files.
-
-    A field's description is its meaning in the dataset card.
-
-    Attributes:
-        seed: -1 if unknown.
-        digest: None in datasets of earlier versions.
-        world: ``libero``; None for the scenes that version 0.2 modelled in code, as for stand_ins.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        versions: versions of the packages on which the numbers depend; None if unknown.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    task_name: str = Field(description="task of the catalogue")
-    memory_type: str = Field(description="temporal, spatial, object or procedural")
-    family: str = Field("", description="group of similar tasks")
-    operations: str = Field("", description="labels of the checkpoints in order, e.g. SUC")
-    seed: Whole = Field(description="seed of the scene")
-    referent: str = Field(
-        "fixed",
-        description="fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it "
-        "(strict tasks)",
-    )
-    variant: Count = Field(description="number of the referent or order; 0 is the published one")
-    success: bool | None = Field(None, description="the goal was reached")
-    exec_start_index: Count = Field(description="first frame of the execution")
-    key_frames: list[Whole] = Field(description="frame at which each checkpoint was completed in order, −1 if never")
-    scene_hash: str | None = Field(None, description="hash of the initial scene")
-    fixture_poses: dict[str, list[Number]] | None = Field(
-        None, description="JSON, fixture to position and quaternion wxyz"
-    )
-    digest: str | None = Field(None, description="sha256 of states, actions and labels")
-    world: str | None = None
-    stand_ins: list[str] | None = None
-    versions: dict[str, str] | None = None
-
-    @classmethod
-    def meanings(cls) -> dict[str, str]:
-        """Return the described fields and their descriptions."""
-        return {name: field.description for name, field in cls.model_fields.items() if field.description}
-
-    def in_frames(self) -> str:
-        """Return the text of the first frame's column."""
-        return self.model_dump_json(exclude_none=True)
-
-    def in_meta(self) -> dict[str, Any]:
-        """Return the columns of ``meta/episodes``."""
-        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
-        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
-            "key_frames": np.array(self.key_frames, dtype=np.int64),
-            "fixture_poses": json.dumps(self.fixture_poses),
-            **elsewhere,
-        }
-
-
-def from_frames(text: str, where: str) -> EpisodeRecord:
-    """Return the record in the text of an episode's first frame.
-
-    Args:
-        text: JSON.
-        where: dataset and episode, for the message.
-
-    Raises:
-        MemobenchError: the text is no record.
-    """
-    try:
-        value = parsed(text)
-        try:
-            return EpisodeRecord.model_validate(value)
-        except ValidationError as error:
-            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
-    except Malformed as error:
-        raise MemobenchError(
-            f"{where}: its column {EPISODE_INFO} is not as this package writes it ({error}); take the dataset from its "
-            "source again"
-        ) from None
-
-
-def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
-    """Return the record in a row of ``meta/episodes``; None if it is missing or incomplete."""
-    values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
-    try:
-        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
-        return EpisodeRecord.model_validate(values | in_json)
-    except (ValidationError, ValueError, TypeError):
-        return None
-
-
-# --- episodes ---
 
 
 @dataclass(frozen=True)
@@ -255,19 +142,14 @@ class RecordedEpisode:
 
     Attributes:
         columns: values per frame; the column ``task`` is the instruction.
-        whole: fields of the episode as a whole.
+        whole: fields that a replay must reproduce (`EpisodeRecord.determined`), and the language rows.
         start: first frame in the dataset's global index.
     """
 
-    task_name: str
-    variant: int
-    seed: int
-    referent: str
-    exec_start: int
+    record: EpisodeRecord
     columns: Columns
     whole: dict[str, Any]
-    start: int = 0
-    world: str | None = None
+    start: int
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
@@ -288,8 +170,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    fields = record.model_dump(include=WHOLE)
-    whole = {key: value for key, value in fields.items() if value not in (None, "")}
+    whole = {key: value for key, value in record.determined().items() if value not in (None, "")}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
         changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
@@ -297,17 +178,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
             raise MemobenchError(
                 f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
             )
-    return RecordedEpisode(
-        record.task_name,
-        record.variant,
-        record.seed,
-        record.referent,
-        record.exec_start_index,
-        columns,
-        whole,
-        place.start,
-        record.world,
-    )
+    return RecordedEpisode(record, columns, whole, place.start)
 
 
 def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
@@ -346,7 +217,7 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
     table = read_table(root / "data", rows=chosen).sort_by("frame_index")
     columns: Columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
-        values = numbers(column) if is_numeric(column.type) else column.to_pylist()
+        values = np.array(numbers(column)) if is_numeric(column.type) else column.to_pylist()
         columns[EARLIER_COLUMNS.get(name, name)] = values
     tasks = read_tasks(root)
     names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
