@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, first_fault, parsed
+from lerobot_memobench.io import Count, Malformed, Number, Whole, checked, parsed
 from lerobot_memobench.sim.scene_hash import LIBERO
 
 DETERMINED = {
@@ -124,16 +124,13 @@ def from_frames(text: str, where: str) -> EpisodeRecord:
         MemobenchError: the text is no record.
     """
     try:
-        value = parsed(text)
-        try:
-            return EpisodeRecord.model_validate(value)
-        except ValidationError as error:
-            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
+        record: EpisodeRecord = checked(parsed(text), EpisodeRecord)
     except Malformed as error:
         raise MemobenchError(
             f"{where}: its column {EPISODE_INFO} is not as this package writes it ({error}); take the dataset from its "
             "source again"
         ) from None
+    return record
 
 
 def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
