@@ -20,8 +20,8 @@ from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert, find_files
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable
+from lerobot_memobench.datasets.images import frame_reader
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest

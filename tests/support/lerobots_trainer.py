@@ -16,14 +16,14 @@ from lerobot_memobench.training import command
 
 
 def run_in_this_process(config: TrainPipelineConfig, config_path: str | None) -> int:
-    from lerobot_memobench.training import lerobots_trainer as trainer
+    from lerobot_memobench.training import samples
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["trainer", *([f"--config_path={config_path}"] if config.resume else [])])
+        patch.setattr(sys, "argv", ["samples", *([f"--config_path={config_path}"] if config.resume else [])])
         patch.setattr(sys, "stdin", io.StringIO(json.dumps(draccus.encode(config))))
-        patch.setattr(trainer, "register_plugins", lambda: None)
-        patch.setattr(trainer.lerobot_train, "make_train_eval_datasets", trainer.open_datasets)
-        trainer.main()
+        patch.setattr(samples, "register_plugins", lambda: None)
+        patch.setattr(samples.lerobot_train, "make_train_eval_datasets", samples.open_datasets)
+        samples.main()
     return 0
 
 

@@ -15,8 +15,8 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 
 from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem as modeling
+from lerobot_memobench.training.data import DecodedSamples
 from lerobot_memobench.training.sampler import frame_sampler
-from lerobot_memobench.training.samples import DecodedSamples
 
 PICTURE = "observation.images.image"
 

@@ -19,8 +19,8 @@ from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.training import command, lerobots_trainer
-from lerobot_memobench.training.lerobots_trainer import keep_in_memory, open_datasets
+from lerobot_memobench.training import command, samples
+from lerobot_memobench.training.samples import keep_in_memory, open_datasets
 
 STATE, SLOTS = "observation.state", "observation.environment_state"
 FEATURES = {STATE: PolicyFeature(FeatureType.STATE, (8,)), SLOTS: PolicyFeature(FeatureType.ENV, (208,))}
@@ -64,16 +64,16 @@ def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Pa
 
 def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(words: list[str], input: bytes, **_: Any) -> SimpleNamespace:
-        assert words[1:] == ["-m", lerobots_trainer.__name__, "--config_path=run"]
+        assert words[1:] == ["-m", samples.__name__, "--config_path=run"]
         monkeypatch.setattr("sys.stdin", io.StringIO(input.decode()))
-        lerobots_trainer.main()
+        samples.main()
         return SimpleNamespace(returncode=0)
 
     received: list[TrainPipelineConfig] = []
     policy = make_policy_config("act", device="cpu", push_to_hub=False)
     config = TrainPipelineConfig(DatasetConfig("local/data"), policy=policy, steps=1, resume=True)
     monkeypatch.setattr(subprocess, "run", run)
-    monkeypatch.setattr(lerobots_trainer, "register_plugins", lambda: None)
+    monkeypatch.setattr(samples, "register_plugins", lambda: None)
     monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
     monkeypatch.setattr(lerobot_train, "train", received.append)
     assert command.run_lerobot(config, "run") == 0
@@ -87,7 +87,7 @@ def test_environments_of_a_training_get_the_plans_of_its_policy(
 ) -> None:
     """LeRobot's trainer opens them without the policy, and holds of strict tasks depend on its plans."""
     dataset = SimpleNamespace(meta=SimpleNamespace(camera_keys=["observation.images.image"]))
-    monkeypatch.setattr(lerobots_trainer, "make_train_eval_datasets", lambda config: (dataset, None))
+    monkeypatch.setattr(samples, "make_train_eval_datasets", lambda config: (dataset, None))
     environment = MemobenchEnvConfig(suite="strict")
     config = make_policy_config(policy, device="cpu", push_to_hub=False)
     open_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))

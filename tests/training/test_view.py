@@ -17,7 +17,7 @@ from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.command_line import parse_words, read_words
-from lerobot_memobench.training.lerobots_trainer import keep_in_memory
+from lerobot_memobench.training.samples import keep_in_memory
 from lerobot_memobench.training.view import Choice, viewed, write_view
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
 from tests.support.held_dataset import STRETCHES, make_held_dataset

@@ -1,37 +1,26 @@
-"""Read frames of a dataset: phases, texts and recorded numbers by global index, and decoded images of a camera."""
+"""Frames of a dataset in main memory: phases, texts and recorded numbers by global index, and samples of them."""
 
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import pyarrow as pa
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
 from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
-from lerobot_memobench.datasets.lerobot_format.damage import naming_damage
-from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
-from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts, undamaged
+from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
 
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
 _PLACE = ("index", "episode_index", "frame_index")
-TOLERANCE = 1e-4
-"""Largest difference of a decoded frame to its time, s."""
-FrameReader = Callable[[int, list[int]], Any]
-"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to another input of an encoder."""
-
-
-# --- phases and texts ---
 
 
 @dataclass
@@ -306,77 +295,47 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
 
 
-# --- images ---
+# --- samples ---
 
 
-def frame_reader(root: Path, camera: str) -> FrameReader:
-    """Return the reader of a camera of the dataset in ``root``; it decodes the frames of a call in one sweep.
+class SamplesInMemory(Dataset[dict[str, Any]]):
+    """LeRobot's samples by their rows, from columns in main memory, without pictures.
 
-    Raises:
-        MemobenchError: the dataset has no such camera or no images, or its metadata is damaged.
+    Args:
+        columns: name -> numbers (N, ...).
+        bounds: first rows of the stretches in which a sample takes its other steps, and N.
+        steps: name of a column -> its steps in a sample, relative to the sample's row.
+        tasks: instructions by ``task_index``.
+        texts: name -> further values (N,).
     """
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    with naming_damage(root):
-        meta = LeRobotDatasetMetadata(root.name, root=without_pattern(root))
-    if not meta.camera_keys:
-        raise MemobenchError(
-            f"{root} holds no pictures, which a detector and perception=pixels need; name a dataset with images, or "
-            "leave detector out with perception=objects"
-        )
-    if camera not in meta.camera_keys:
-        raise MemobenchError(
-            f"The dataset {root} has no camera '{camera}'; it has {', '.join(meta.camera_keys)}. "
-            "Choose one with --policy.memory_camera."
-        )
-    return (_video_reader if camera in meta.video_keys else _image_reader)(root, camera, meta)
+    def __init__(
+        self,
+        columns: Mapping[str, Tensor],
+        bounds: np.ndarray,
+        steps: Mapping[str, Sequence[int]],
+        tasks: Sequence[str],
+        texts: Mapping[str, pa.Array] | None = None,
+    ) -> None:
+        self._columns, self._texts, self._tasks = columns, texts or {}, tasks
+        self._bounds = torch.from_numpy(bounds)
+        self._steps = {name: torch.tensor([*own]) for name, own in steps.items()}
 
+    def __getitem__(self, row: int) -> dict[str, Any]:
+        return self.__getitems__([row])[0]
 
-def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
-    height, width, channels = meta.features[camera]["shape"]
-    decode = _decoder()
-    lock = threading.Lock()
-
-    def read(episode: int, numbers: list[int]) -> Tensor:
-        with lock:
-            row = meta.episodes[episode]
-            path = root / meta.get_video_file_path(episode, camera)
-        start = row[f"videos/{camera}/from_timestamp"]
-        with undamaged(path):
-            images = decode(path, [start + number / meta.fps for number in numbers])
-            return images.reshape(len(numbers), channels, height, width)
-
-    return read
-
-
-def _decoder() -> Callable[[Path, list[float]], Tensor]:
-    """Return a function from a video and times in it, s, to its frames."""
-    from lerobot.datasets import video_utils
-
-    backend = video_utils.get_safe_default_video_backend()
-    own = threading.local()
-
-    def decode(path: Path, times: list[float]) -> Tensor:
-        if backend != "torchcodec":
-            return video_utils.decode_video_frames(path, times, tolerance_s=TOLERANCE, backend=backend)
-        # LeRobot shares decoders within a process, but two threads must not use the same one.
-        if not hasattr(own, "decoders"):
-            own.decoders = video_utils.VideoDecoderCache(max_size=1)
-        return video_utils.decode_video_frames_torchcodec(path, times, TOLERANCE, decoder_cache=own.decoders)
-
-    return decode
-
-
-def _image_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
-    """Return the reader of a camera whose images are stored in the tables."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset(root.name, root=without_pattern(root))
-    starts = meta.episodes["dataset_from_index"]
-    lock = threading.Lock()
-
-    def read(episode: int, numbers: list[int]) -> Tensor:
-        with lock:
-            return torch.stack([dataset[starts[episode] + number][camera] for number in numbers])
-
-    return read
+    def __getitems__(self, rows: Sequence[int]) -> list[dict[str, Any]]:
+        """Return the samples of several rows, each column read once."""
+        at = torch.tensor(rows)
+        found: dict[str, Any] = {name: column[at] for name, column in self._columns.items() if name not in self._steps}
+        after = torch.searchsorted(self._bounds, at, right=True)
+        first, end = self._bounds[after - 1, None], self._bounds[after, None]
+        for name, steps in self._steps.items():
+            wanted = at[:, None] + steps
+            found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
+            if name in self._columns:
+                found[name] = self._columns[name][wanted.clamp(first, end - 1)]
+        parts: dict[str, Any] = {name: values.unbind() for name, values in found.items()}
+        parts |= {name: values.take(pa.array(rows)).to_pylist() for name, values in self._texts.items()}
+        parts["task"] = [self._tasks[number] for number in found["task_index"].tolist()]
+        return [dict(zip(parts, values, strict=True)) for values in zip(*parts.values(), strict=True)]

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.frames import frame_reader, read_frame_table, read_recorded
+from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
+from lerobot_memobench.datasets.images import frame_reader
 from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
 from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE
 from lerobot_memobench.datasets.lerobot_format.tables import read_info

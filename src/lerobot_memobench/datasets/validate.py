@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
-from lerobot_memobench.datasets.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.images import FrameReader, frame_reader
 from lerobot_memobench.datasets.lerobot_format.columns import (
     EXECUTED_ACTION,
     LANGUAGE,

@@ -123,7 +123,7 @@ def run_lerobot(config: TrainPipelineConfig, config_path: str | None) -> int:
     import draccus
 
     line = [f"--config_path={config_path}"] if config.resume and config_path is not None else []
-    command = [sys.executable, "-m", "lerobot_memobench.training.lerobots_trainer", *line]
+    command = [sys.executable, "-m", "lerobot_memobench.training.samples", *line]
     return subprocess.run(command, input=json.dumps(draccus.encode(config)).encode(), check=False).returncode
 
 

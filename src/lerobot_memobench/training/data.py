@@ -1,4 +1,4 @@
-"""Open the data of a training: datasets, the lookup of their frames, and processors."""
+"""Open the data of a training: datasets, the lookup of their frames, samples and processors."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from lerobot_memobench.datasets.frames import (
     Encoded,
     FrameLookup,
     Remember,
+    SamplesInMemory,
     TextEncoder,
     read_frame_table,
     read_recorded,
@@ -53,7 +54,7 @@ from lerobot_memobench.policies.memobench_mem.targets import with_targets
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
-from lerobot_memobench.training.samples import DecodedSamples, SamplesInMemory
+from lerobot_memobench.training.sampler import seed_of
 
 logger = logging.getLogger(__name__)
 
@@ -248,6 +249,28 @@ def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
     name = "words" if config.align == "none" else config.text_encoder
     assert name is not None  # the configuration sets it
     return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
+
+
+# -- samples -----------------------------------------------------------------------------------------------------------
+
+
+class DecodedSamples(Dataset[dict[str, Any]]):
+    """LeRobot's samples by their global indices, pictures included; actions of a chunk after a hold are padding.
+
+    With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, lookup: FrameLookup, chunk: Sequence[int], seed: int) -> None:
+        self._dataset, self._seed, self._row = dataset, seed, dataset.absolute_to_relative_idx
+        self._lookup, self._chunk = lookup, torch.tensor([*chunk])
+
+    def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
+        index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(seed_of(self._seed, number, 0, 0))
+            found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
+        found[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
+        return found
 
 
 # -- processors --------------------------------------------------------------------------------------------------------

@@ -1,83 +1,100 @@
-"""Training samples: LeRobot's, decoded from videos or taken from main memory.
-
-LeRobot decodes all videos of a sample, and reads a table for each time of each column of a history. Here numbers are
-tensors and pictures are left out; all else of a sample equals LeRobot's to the bit.
-"""
+"""LeRobot's trainer, with samples from main memory for policies without pictures: ``python -m`` runs it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import logging
+import sys
 from typing import Any
 
+import draccus
 import numpy as np
 import pyarrow as pa
 import torch
-from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import ACTION
+from lerobot.configs import FeatureType
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.factory import make_train_eval_datasets
+from lerobot.scripts import lerobot_train
 from torch import Tensor
-from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.frames import FrameLookup
-from lerobot_memobench.training.sampler import seed_of
+from lerobot_memobench.datasets.frames import SamplesInMemory
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs.processes import lock_refusal
+from lerobot_memobench.run.command_line import register_plugins
+
+logger = logging.getLogger(__name__)
 
 
-class SamplesInMemory(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their rows, from columns in main memory, without pictures.
+def keep_in_memory(dataset: Any) -> None:
+    """Let an opened dataset return its samples from main memory, without pictures."""
+    reader: Any = dataset.reader
+    names = [name for name in reader.hf_dataset.column_names if name not in dataset.meta.camera_keys]
+    table = reader.hf_dataset.select_columns(names)
+    first, arrow = table[0], table.with_format("arrow")[:]
+    columns: dict[str, Tensor] = {}
+    texts: dict[str, pa.Array] = {}
+    for name, like in first.items():
+        column = arrow.column(name).combine_chunks()
+        if isinstance(like, Tensor):
+            columns[name] = _tensor(column, like)
+        else:
+            texts[name] = column.dictionary_encode() if pa.types.is_string(column.type) else column
+    # A reader may have some episodes only.
+    starts = np.flatnonzero(np.diff(columns["episode_index"].numpy(), prepend=-1))
+    bounds = np.append(starts, len(table))
+    held = SamplesInMemory(columns, bounds, reader.delta_indices or {}, dataset.meta.tasks.index.tolist(), texts)
+    reader.get_item = held.__getitem__
+    dataset.__getitems__ = held.__getitems__  # torch's loader asks for a batch at once
 
-    Args:
-        columns: name -> numbers (N, ...).
-        bounds: first rows of the stretches in which a sample takes its other steps, and N.
-        steps: name of a column -> its steps in a sample, relative to the sample's row.
-        tasks: instructions by ``task_index``.
-        texts: name -> further values (N,).
+
+def _tensor(column: Any, like: Tensor) -> Tensor:
+    """Return a column in the type and shape of LeRobot's first row."""
+    rows = len(column)
+    while isinstance(column, pa.ExtensionArray | pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        column = column.storage if isinstance(column, pa.ExtensionArray) else column.flatten()
+    numbers = torch.from_numpy(column.to_numpy(zero_copy_only=False).copy())
+    return numbers.to(like.dtype).reshape(rows, *like.shape)
+
+
+def needs_no_pictures(config: TrainPipelineConfig, dataset: Any) -> bool:
+    """Return whether a policy reads no picture of an opened dataset."""
+    inputs = getattr(config.policy, "input_features", None) or {}
+    seen = any(one.type is FeatureType.VISUAL for one in inputs.values()) if inputs else bool(dataset.meta.camera_keys)
+    return config.policy is not None and not config.dataset.streaming and not seen
+
+
+def open_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
+    """Open LeRobot's datasets of a training and of its held-out episodes; keep them in memory without pictures.
+
+    LeRobot opens environments without the policy, so those of the benchmark receive its plans here.
     """
-
-    def __init__(
-        self,
-        columns: Mapping[str, Tensor],
-        bounds: np.ndarray,
-        steps: Mapping[str, Sequence[int]],
-        tasks: Sequence[str],
-        texts: Mapping[str, pa.Array] | None = None,
-    ) -> None:
-        self._columns, self._texts, self._tasks = columns, texts or {}, tasks
-        self._bounds = torch.from_numpy(bounds)
-        self._steps = {name: torch.tensor([*own]) for name, own in steps.items()}
-
-    def __getitem__(self, row: int) -> dict[str, Any]:
-        return self.__getitems__([row])[0]
-
-    def __getitems__(self, rows: Sequence[int]) -> list[dict[str, Any]]:
-        """Return the samples of several rows, each column read once."""
-        at = torch.tensor(rows)
-        found: dict[str, Any] = {name: column[at] for name, column in self._columns.items() if name not in self._steps}
-        after = torch.searchsorted(self._bounds, at, right=True)
-        first, end = self._bounds[after - 1, None], self._bounds[after, None]
-        for name, steps in self._steps.items():
-            wanted = at[:, None] + steps
-            found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
-            if name in self._columns:
-                found[name] = self._columns[name][wanted.clamp(first, end - 1)]
-        parts: dict[str, Any] = {name: values.unbind() for name, values in found.items()}
-        parts |= {name: values.take(pa.array(rows)).to_pylist() for name, values in self._texts.items()}
-        parts["task"] = [self._tasks[number] for number in found["task_index"].tolist()]
-        return [dict(zip(parts, values, strict=True)) for values in zip(*parts.values(), strict=True)]
+    if isinstance(config.env, MemobenchEnvConfig):
+        config.env.declare_plans(config.policy)
+    datasets: tuple[Any, Any] = make_train_eval_datasets(config)
+    if needs_no_pictures(config, datasets[0]):
+        for dataset in datasets:
+            if dataset is not None:
+                keep_in_memory(dataset)
+        config.num_workers = 0  # each would hold a copy
+        logger.info("samples are read from main memory, num_workers=0")
+    return datasets
 
 
-class DecodedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, pictures included; actions of a chunk after a hold are padding.
+def main() -> None:
+    """Run LeRobot's trainer with the configuration in the standard input, as JSON."""
+    register_plugins()
+    config = draccus.decode(TrainPipelineConfig, json.load(sys.stdin))
+    lerobot_train.make_train_eval_datasets = open_datasets
+    try:
+        lerobot_train.train(config)
+    except MemobenchError as error:
+        sys.exit(f"lerobot: {error}")
+    except OSError as error:
+        if (refusal := lock_refusal(error)) is None:
+            raise
+        sys.exit(f"lerobot: {refusal}")
 
-    With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
-    """
 
-    def __init__(self, dataset: LeRobotDataset, lookup: FrameLookup, chunk: Sequence[int], seed: int) -> None:
-        self._dataset, self._seed, self._row = dataset, seed, dataset.absolute_to_relative_idx
-        self._lookup, self._chunk = lookup, torch.tensor([*chunk])
-
-    def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
-        index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
-        with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed_of(self._seed, number, 0, 0))
-            found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
-        found[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
-        return found
+if __name__ == "__main__":
+    main()
