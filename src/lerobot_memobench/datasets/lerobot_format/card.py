@@ -35,18 +35,6 @@ SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; no data of people or robots was collected. Actions were recorded as "
     "applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
-OWN_TERMS = "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them."
-LIBERO_TERMS = (
-    "The scenes consist of LIBERO's assets (Liu et al., 2023). LIBERO's code is under MIT and its datasets are under "
-    "CC BY 4.0; the packages of its assets state MIT. Name LIBERO where you show the images. The additions of "
-    "`lerobot_memobench`, such as actions, labels and tables, are under Apache-2.0."
-)
-AUTHORS_TERMS = (
-    "{subject} of MEMOBench's authors are under CC BY-NC 4.0 by the licence of their repository, "
-    "Collab-Gen/MEMOBench; their paper announces CC BY 4.0 for the data. Unless they say otherwise, use this dataset "
-    "for research that is not commercial, and name them (Sun et al.)."
-)
-
 FAMILIES: dict[str, dict[str, Any]] = {name: raw_tables()["demo_statistics"][name] for name in (*MEMORY_TYPES, "total")}
 """Rows of the paper's appendix, "Family level statistics"; ``gib``: size of its HDF5 files."""
 LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
@@ -147,7 +135,7 @@ def _card(
         made: paragraphs on its making.
         location: arguments of ``LeRobotDataset`` that load it.
     """
-    licence, section = terms(infos)
+    licence, is_libero, of_authors = terms(infos)
     data = DatasetCardData(
         license=licence,
         task_categories=["robotics"],
@@ -176,9 +164,10 @@ def _card(
         convention=convention_of(features),
         columns=markdown(["column", "type", "meaning"], shown),
         episode_columns=markdown(["column", "meaning"], [[f"`{key}`", text] for key, text in described]),
-        licence=section,
+        is_libero=is_libero,
+        of_authors=of_authors,
     )
-    return f"{card}\n"
+    return str(card).rstrip() + "\n"
 
 
 def _type(feature: dict[str, Any]) -> str:
@@ -196,13 +185,14 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
 # --- the licence ---
 
 
-def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
-    """Return a dataset's licence, as the hub names it, and the licence section of its card.
-
-    They depend on the source of the scenes and on that of the demonstrations.
+def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, bool, list[str]]:
+    """Return a dataset's licence, as the hub names it, and its reasons.
 
     Args:
         infos: information on its episodes (`staging.episode_info`).
+
+    Returns:
+        The licence, whether scenes are LIBERO's, and the parts that are of MEMOBench's authors.
     """
     infos = list(infos)
     there = [info for info in infos if info.get(WORLD) == LIBERO]
@@ -210,10 +200,8 @@ def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
         "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
         "The scanned objects": any(map(_shows_scans, there)),
     }
-    parts = [AUTHORS_TERMS.format(subject=subject) for subject, shown in theirs.items() if shown]
-    if not there and not parts:
-        return "apache-2.0", OWN_TERMS
-    return "cc-by-nc-4.0" if parts else "other", "\n\n".join([*([LIBERO_TERMS] if there else []), *parts])
+    parts = [part for part, shown in theirs.items() if shown]
+    return "cc-by-nc-4.0" if parts else "other" if there else "apache-2.0", bool(there), parts
 
 
 def _shows_scans(info: Mapping[str, Any]) -> bool:
