@@ -126,20 +126,20 @@ def _check_video(path: Path, frames: int) -> None:
         raise MemobenchError(f"{path} has {there} frames, meta/episodes names {frames}; {ADVICE}")
 
 
-def damaged_file(folder: Path) -> str | None:
-    """Read a whole dataset; return a message that names the first unreadable file, None if all can be read."""
+def read_all(folder: Path) -> None:
+    """Read a whole dataset to its end.
+
+    Raises:
+        MemobenchError: naming the first file that is missing or cannot be read.
+    """
     tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
     for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
-        try:
-            if not path.is_file():
-                return f"{path} is missing; {ADVICE}"
-            if path.suffix == ".json":
-                read_json(path, dict[str, dict[str, Any]], ADVICE, nan=True)
-            else:
-                read_to_end(path)
-        except MemobenchError as error:
-            return str(error)
-    return None
+        if not path.is_file():
+            raise MemobenchError(f"{path} is missing; {ADVICE}")
+        if path.suffix == ".json":
+            read_json(path, dict[str, dict[str, Any]], ADVICE, nan=True)
+        else:
+            read_to_end(path)
 
 
 def read_to_end(path: Path) -> None:
@@ -180,8 +180,9 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
         reading = any(name.startswith(("lerobot.datasets.", "datasets.", "torch.utils.data.")) for name in names)
         if folder is None or not reading or not (folder / INFO_FILE).is_file():
             raise
-        message = damaged_file(folder)
-        if message is None:
+        try:
+            read_all(folder)
             check_whole(folder)
-            raise
-        raise MemobenchError(message) from error
+        except MemobenchError as damage:
+            raise damage from error
+        raise
