@@ -149,7 +149,7 @@ def _card(
     described = EpisodeRecord.meanings().items()
     card = DatasetCard.from_template(
         data,
-        str(Path(__file__).with_name("card.md")),
+        str(Path(__file__).with_name("card.md.jinja")),
         total=total,
         types=ordered_types(infos),
         former=any(info.get(WORLD) != LIBERO for info in infos),
