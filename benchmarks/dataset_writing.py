@@ -36,7 +36,7 @@ from lerobot_memobench.datasets.demonstration import Demonstration, labels
 from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.hdf5 import PublishedFile
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.lerobot_format.columns import (
     EPISODE_INFO,
     EXECUTED_ACTION,
     PRIVILEGED,

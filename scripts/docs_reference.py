@@ -62,7 +62,7 @@ PUBLIC = {
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Difference compare"),
+    "Comparison": ("evaluation.comparison", "Comparison Contrast compare"),
     "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
@@ -206,7 +206,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
 def spaces_page() -> str:
     """Return the page of observation and action spaces."""
     from lerobot_memobench import protocol
-    from lerobot_memobench.datasets.lerobot_format.layout import ACTION_NAMES, PROPRIO_NAMES
+    from lerobot_memobench.datasets.lerobot_format.columns import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
     from lerobot_memobench.envs.pacing import longest
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
@@ -281,15 +281,15 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
-    from lerobot_memobench.datasets.lerobot_format.card import COLUMNS, EPISODE_COLUMNS
-    from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS, dataset_features
+    from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
+    from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
     rows = [
-        [code(name), f"{feature['dtype']} {tuple(feature['shape'])}", COLUMNS[name]]
+        [code(name), f"{feature['dtype']} {tuple(feature['shape'])}", MEANINGS[name]]
         for name, feature in features.items()
-        if name in COLUMNS
+        if name in MEANINGS
     ]
     parts = [
         "# Dataset columns",
@@ -299,7 +299,7 @@ def dataset_page() -> str:
         "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EPISODE_COLUMNS.items()]),
+        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EpisodeRecord.meanings().items()]),
     ]
     return "\n\n".join(parts) + "\n"
 

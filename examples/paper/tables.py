@@ -18,8 +18,8 @@ from lerobot_memobench.evaluation.controls import gap_closed
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.evaluation.report_tables import run_row, wide_table
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, WRITERS, Cell, Count, Report, Section, Table, figure
+from lerobot_memobench.evaluation.report_tables import LEADING, NOTE, PAPER_COLUMNS, run_row, wide_columns
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, WRITERS, Cell, Report, Section, Table, figure
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
@@ -55,7 +55,8 @@ def rates_table(runs: Sequence[Run], key: str, title: str, tables: Sequence[str]
     rows = (*(run_row(run) for run in runs), *map(published_cells, published))
     steps = [row.replan_steps for row in published]
     changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
-    return wide_table(key, title, rows, strong=range(len(runs)), rules={len(runs), *changes})
+    wide = wide_columns(LEADING, PAPER_COLUMNS, METRICS)
+    return Table(key, title, rows=rows, note=NOTE, strong=range(len(runs)), rules={len(runs), *changes}, **wide)
 
 
 def published_cells(row: PublishedRow) -> tuple[Cell, ...]:
@@ -74,7 +75,7 @@ def failures_table() -> Table:
     """Return the outcomes of the paper's rollouts of one temporal task."""
     counts = dict(RAW["failure_taxonomy"])
     total = counts.pop("rollouts")
-    rows = tuple((name.replace("_", " "), Count(count), Rate(count / total, total)) for name, count in counts.items())
+    rows = [(name.replace("_", " "), count, Rate(count / total, total)) for name, count in counts.items()]
     title = f"The paper's outcomes of {total} rollouts of a temporal task with the checkpoints S, U, U"
     return Table("paper-failures", title, ("outcome", "rollouts", "of all"), rows)
 
@@ -90,7 +91,7 @@ def oracle_table() -> Table:
         rows.append((name, *cells, *(figure(gap_closed(a, b)) for a, b in pairs)))
     header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
     title = f"The paper's standard/oracle memory, replan interval {standard.replan_steps}"
-    return Table("paper-oracle", title, header, tuple(rows), strong=frozenset({len(rows) - 1}))
+    return Table("paper-oracle", title, header, rows, strong={len(rows) - 1})
 
 
 def shuffled_table() -> Table:
@@ -106,7 +107,7 @@ def paper_report(runs: Sequence[Run]) -> Report:
     """Return the paper's tables with these evaluations."""
     tables = (*(rates_table(runs, *each) for each in RATES), failures_table(), oracle_table(), shuffled_table())
     notes = [f"{run.name} departs from the paper: {', '.join(found)}" for run in runs if (found := departures(run))]
-    return Report(headline(runs), (Section("With the paper's results", tables, notes=tuple(notes)),))
+    return Report(headline(runs), [Section("With the paper's results", tables, notes=notes)])
 
 
 def main() -> None:

@@ -32,7 +32,7 @@ Runs = Sequence[Sequence[Record]]
 
 
 @dataclass(frozen=True)
-class Contrast:
+class SeedContrast:
     """A row's success minus that of a reference, averaged as the report averages; fractions.
 
     Attributes:
@@ -54,7 +54,7 @@ class Contrast:
     p_of_seeds: float | None
 
 
-def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str = "reference") -> Contrast:
+def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str = "reference") -> SeedContrast:
     """Return a row's difference from a reference with the same training seeds; its p are not adjusted.
 
     Raises:
@@ -68,7 +68,7 @@ def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str
     of_seeds = gap @ weights
     before = base.mean(axis=0)  # an episode counts once, however many policies were trained
     low, high = difference_interval(_draws(gap, weights, tasks, rng), before, before + gap.mean(axis=0), weights)
-    return Contrast(
+    return SeedContrast(
         float(of_seeds.mean()),
         low,
         high,
@@ -80,7 +80,7 @@ def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str
     )
 
 
-def adjusted(found: Mapping[str, Contrast]) -> dict[str, Contrast]:
+def adjusted(found: Mapping[str, SeedContrast]) -> dict[str, SeedContrast]:
     """Return differences with p adjusted for their number (Holm)."""
     of_episodes = holm([each.p for each in found.values()])
     tested = {name: each.p_of_seeds for name, each in found.items() if each.p_of_seeds is not None}

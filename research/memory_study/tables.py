@@ -18,7 +18,7 @@ from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.memory_study.cells import Cell, difference
-from research.memory_study.contrasts import Contrast, adjusted, average_success, contrast, episodes_of
+from research.memory_study.contrasts import SeedContrast, adjusted, average_success, contrast, episodes_of
 from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid
 
 REFERENCES = ("no memory", "clock of the execution", "frames", "contrastive")
@@ -322,7 +322,7 @@ def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
     return _contrasts_table(adjusted(found), reference) if found else ""
 
 
-def _contrasts_table(found: Mapping[str, Contrast], reference: str) -> str:
+def _contrasts_table(found: Mapping[str, SeedContrast], reference: str) -> str:
     lines = [
         [
             f"{name} minus {reference}",

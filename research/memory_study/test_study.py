@@ -17,8 +17,9 @@ from typing import IO, Any
 import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import CARD_FILE, protocol_of_log, read_run
+from lerobot_memobench.evaluation.records import protocol_of_log, read_run
 from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
@@ -338,7 +339,7 @@ def evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **mor
             "protocol": protocol_of_log(episodes),
             "runs": [{"command": [*cell.carded_words(part), "resume=true"]}],
         }
-        (cell.evaluation(part) / CARD_FILE).write_text(json.dumps(card))
+        (cell.evaluation(part) / EVALUATION_FILE).write_text(json.dumps(card))
     for part in (*parts, TRAINING):
         words = cell.training_words() if part == TRAINING else cell.evaluation_words(part)
         cell.log(part).with_suffix(".json").write_text(json.dumps({**COMMAND, "words": words, "ended": True}))
@@ -417,7 +418,7 @@ def test_inconsistent_results_are_refused(no_memory: Cell, frames: Cell, tmp_pat
         case "log":
             frames.log(ROLLOUTS).with_suffix(".json").write_text('{"ended": true}')
         case "card":
-            (folder / CARD_FILE).unlink()
+            (folder / EVALUATION_FILE).unlink()
         case "row":
             shutil.copytree(no_memory.evaluation(ROLLOUTS), folder, dirs_exist_ok=True)
         case "cut":

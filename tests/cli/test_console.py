@@ -19,8 +19,8 @@ from rich.console import Console, RenderableType
 from lerobot_memobench.cli.console import counting, one_sentence, run_command
 from lerobot_memobench.cli.memobench import task_table
 from lerobot_memobench.evaluation.metrics import summarise
-from lerobot_memobench.evaluation.report import table
-from lerobot_memobench.evaluation.tables import Unbroken
+from lerobot_memobench.evaluation.report_tables import rates_table
+from lerobot_memobench.evaluation.tables import Unbroken, terminal_table
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 
@@ -63,7 +63,7 @@ def tables() -> dict[str, RenderableType]:
         }
         for task in found
     ]
-    return {"tasks": Unbroken(task_table(found), column=1), "report": table(summarise(solved))}
+    return {"tasks": Unbroken(task_table(found), column=1), "report": terminal_table(rates_table(summarise(solved)))}
 
 
 @pytest.mark.parametrize("terminal", [True, False])

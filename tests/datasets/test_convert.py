@@ -20,11 +20,13 @@ from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert, find_files
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable
+from lerobot_memobench.datasets.images import frame_reader
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset, read_info, read_manifest
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import read_episode
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.restore import ORIENTATIONS, restore, task_of
 from lerobot_memobench.datasets.validate import images_of, replay
 from lerobot_memobench.datasets.video import VideoWriter
@@ -475,7 +477,7 @@ def test_bad_archives(written, tmp_path, monkeypatch, capsys):
     for name in [*names, "cut.hdf5"]:
         (line,) = [line for line in out.splitlines() if line.startswith(f"left out: {name.replace(chr(10), '?')}: ")]
         assert ("cannot be unpacked" if name == "cut.hdf5" else "names no file") in line
-    assert read_episode(tmp_path / "ds", 1).task_name == BUTTER
+    assert read_episode(tmp_path / "ds", 1).record.task_name == BUTTER
     (tmp_path / "cut.zip").write_bytes(source.read_bytes()[:-100])
     with zipfile.ZipFile(tmp_path / "empty.zip", "w") as archive:
         archive.writestr("README.md", "about an empty archive")

@@ -14,9 +14,11 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_memobench.datasets import recording
-from lerobot_memobench.datasets.frames import frame_reader
 from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.lerobot_format.layout import episode_count, is_dataset, read_info
+from lerobot_memobench.datasets.images import frame_reader
+from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.validate import episode_count
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task

@@ -13,7 +13,8 @@ from lerobot.scripts import lerobot_edit_dataset as tool
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, MANIFEST_FILE
+from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO
+from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode
 from lerobot_memobench.datasets.publish import describe
 from lerobot_memobench.datasets.validate import Verdict

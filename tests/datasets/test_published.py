@@ -69,7 +69,7 @@ def test_file_of_the_authors_script(drawer, tmp_path, backwards):
         np.testing.assert_array_equal(episode.columns["privileged.environment_state"], drawer.objects)
         for name, pose in drawer.fixture_poses.items():
             np.testing.assert_array_equal(episode.whole["fixture_poses"][name], pose)
-        assert (episode.world, episode.whole["key_frames"], episode.whole["success"]) == (LIBERO, [SHUT], True)
+        assert (episode.record.world, episode.whole["key_frames"], episode.whole["success"]) == (LIBERO, [SHUT], True)
     with h5py.File(path) as file:
         assert np.array_equal(file["data/demo_1/states"][:], drawer.states) != backwards
 

@@ -25,8 +25,9 @@ from lerobot_memobench.datasets import statistics
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import image_key, read_info
+from lerobot_memobench.datasets.lerobot_format.columns import image_key
 from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes, read_episode
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.statistics import check_statistics, complete, lacking, measured
 from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
 from lerobot_memobench.datasets.video import ImageHistograms

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import Comparison, Difference, compare, comparison_report
+from lerobot_memobench.evaluation.comparison import Comparison, Contrast, compare, comparison_report
 from lerobot_memobench.evaluation.metrics import METRICS, value_of
 from lerobot_memobench.evaluation.records import read_runs, unlike
 from lerobot_memobench.evaluation.report_tables import AVERAGE
@@ -26,8 +26,8 @@ def compared(a: Path, b: Path, **options: Any) -> Comparison:
     return compare(first, second, **options)
 
 
-def find(found: Comparison, scope: str, metric: str) -> Difference:
-    (row,) = [row for row in found.differences if (row.scope, row.metric) == (scope, metric)]
+def find(found: Comparison, scope: str, metric: str) -> Contrast:
+    (row,) = [row for row in found.contrasts if (row.scope, row.metric) == (scope, metric)]
     return row
 
 
@@ -53,7 +53,7 @@ def test_counted_by_hand(tmp_path: Path) -> None:
     assert find(found, "spatial", "MCR").value == 0.375
     assert find(found, "spatial", "MUR").p == 1.0  # both have all of them
     assert find(found, "one", "MUR").p == 2 / 8  # three differ, all one way
-    assert not [row for row in found.differences if (row.scope, row.metric) == ("one", "MCR")]
+    assert not [row for row in found.contrasts if (row.scope, row.metric) == ("one", "MCR")]
     report = comparison_report(found)
     assert f"| {AVERAGE} | SR | 16 | 25.0 | 62.5 | +37.5 | " in markdown(report)
     assert "| 0 / 6 | 0.031 |" in markdown(report)

@@ -138,7 +138,7 @@ def test_intervals_of_all_rates_are_over_scenes(tmp_path: Path) -> None:
         for name, lines in (("a", none), ("b", records)):
             write_episodes(tmp_path / f"{name}{len(widths)}", lines)
         first, second = read_runs([tmp_path / f"{name}{len(widths)}" for name in "ab"])
-        low, high = compare(first, second, permutations=10).differences[0].interval
+        low, high = compare(first, second, permutations=10).contrasts[0].interval
         widths.append(high - low)
     assert widths[0] > 1.4 * widths[1], "by about the square root of three"
 

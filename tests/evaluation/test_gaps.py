@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.evaluation.gaps import success_by_gap
-from lerobot_memobench.evaluation.plots import draw_figures
+from lerobot_memobench.evaluation.plots import draw_figures, success_by_gap
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.gap import gaps, longest_gap

@@ -181,7 +181,9 @@ def test_json(sweep: list[Run], tmp_path: Path) -> None:
 
 
 def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = csv_text([["=cmd()", -3.5, None], ["@SUM(1)", "a, b", "-"]], ["name", "figure", "rest"])
+    text = csv_text(
+        [{"name": "=cmd()", "figure": -3.5, "rest": None}, {"name": "@SUM(1)", "figure": "a, b", "rest": "-"}]
+    )
     assert list(csv.reader(io.StringIO(text)))[1:] == [["'=cmd()", "-3.5", ""], ["'@SUM(1)", "a, b", "'-"]]
     found = build(sweep)
     rows = list(csv.DictReader(io.StringIO(csv_tables(found)["joined"])))

@@ -22,7 +22,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lerobot_memobench.datasets.frames import frame_reader
+from lerobot_memobench.datasets.images import frame_reader
 from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, OBJECTS, PRIVILEGED
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.scene_hash import LIBERO

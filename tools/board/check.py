@@ -20,7 +20,7 @@ from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPU
 from lerobot_memobench.envs.pacing import paused
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.evaluation.asked import check_lines
+from lerobot_memobench.evaluation.agreement import check_lines
 from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.lerobot_config import tree_hash
 from lerobot_memobench.protocol import EVIDENCE_EPISODES, PROMPT_HORIZON

@@ -9,7 +9,7 @@ from pathlib import Path
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.episode_log import INPUTS
-from lerobot_memobench.evaluation.comparison import Difference, compare
+from lerobot_memobench.evaluation.comparison import Contrast, compare
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
@@ -49,7 +49,7 @@ class BoardRow:
     episodes: int
     rates: Row
     evidence: Evidence | None
-    pauses: Difference | None
+    pauses: Contrast | None
     without_memory: Rate | None
 
 
@@ -68,9 +68,9 @@ def board_row(
     """Return the row of a checked submission; ``others`` may hold its partner without a memory."""
     evaluation, controls = submission.evaluation, submission.controls
     protocol, run = evaluation.protocol, evaluation.run
-    changes: tuple[Difference, ...] = ()
+    changes: tuple[Contrast, ...] = ()
     if PAUSES in controls:
-        changes = compare(run, controls[PAUSES].run, permutations=100).differences
+        changes = compare(run, controls[PAUSES].run, permutations=100).contrasts
     partner = next((each for each in others if each.name == submission.about.without_memory), None)
     return BoardRow(
         name=submission.name,
@@ -107,7 +107,7 @@ def evidence_text(found: Evidence | None) -> str:
     return f"{with_interval(follows.value, follows.low, follows.high)}, chance {figure(found.chance)}"
 
 
-def pauses_text(found: Difference | None) -> str:
+def pauses_text(found: Contrast | None) -> str:
     """Return the change of SR by pauses, in points: ``-3.0 [-6.1–0.2]``."""
     if found is None:
         return NOT_APPLICABLE

@@ -24,7 +24,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict
 from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, read_log, with_omitted
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, asked_for
+from lerobot_memobench.evaluation.records import Run, requested_lines
 from lerobot_memobench.io import PACKED, refuse_links, write_file
 from lerobot_memobench.run.card import write_card
 
@@ -153,7 +153,7 @@ def own_evaluation(folder: Path) -> Evaluation:
         MemobenchError: it lacks its card, or a line of its log contradicts the card.
     """
     card = read_evaluation(folder, whole=True)
-    return Evaluation(folder, card, asked_for(folder, read_log(folder)))
+    return Evaluation(folder, card, requested_lines(folder, read_log(folder)))
 
 
 # --- writing ---

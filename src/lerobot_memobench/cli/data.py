@@ -230,7 +230,7 @@ def view(
     ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
-    from lerobot_memobench.datasets.lerobot_format.layout import read_info
+    from lerobot_memobench.datasets.lerobot_format.tables import read_info
     from lerobot_memobench.training.view import choice_for, write_view
 
     if obs_type is not None:

@@ -238,13 +238,14 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
     from lerobot_memobench.evaluation.headline import headline
-    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, table
-    from lerobot_memobench.evaluation.report_tables import failure_line
+    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
+    from lerobot_memobench.evaluation.report_tables import failure_line, rates_table
+    from lerobot_memobench.evaluation.tables import terminal_table
 
     screen = console()
     screen.print()
     screen.print(headline([run]), style="bold")
-    screen.print(table(run.summary), crop=False)
+    screen.print(terminal_table(rates_table(run.summary)), crop=False)
     screen.print(failure_line(run.summary))
     for line in run.notes:
         screen.print(f"note: {line}")

@@ -29,13 +29,7 @@ class ReportFormat(StrEnum):
     JSON = "json"
 
 
-ENDINGS = {
-    ReportFormat.TABLE: "txt",
-    ReportFormat.MARKDOWN: "md",
-    ReportFormat.CSV: "csv",
-    ReportFormat.LATEX: "tex",
-    ReportFormat.JSON: "json",
-}
+ENDINGS = {ReportFormat.TABLE: "txt", ReportFormat.MARKDOWN: "md", ReportFormat.LATEX: "tex", ReportFormat.JSON: "json"}
 
 Formats = Annotated[
     list[ReportFormat] | None,
@@ -180,10 +174,12 @@ def show_report(
         if out is None and each is ReportFormat.TABLE:
             console().print(terminal(report), crop=False)
             continue
-        texts = {f"{name}.{ENDINGS[each]}": WRITERS[each](report)}
-        if each is ReportFormat.CSV:
-            tables = {f"tables/{key}.csv": text for key, text in csv_tables(report).items()}
-            texts = tables if as_csv is None else {f"{name}.csv": as_csv}
+        if each is not ReportFormat.CSV:
+            texts = {f"{name}.{ENDINGS[each]}": WRITERS[each](report)}
+        elif as_csv is None:
+            texts = {f"tables/{key}.csv": text for key, text in csv_tables(report).items()}
+        else:
+            texts = {f"{name}.csv": as_csv}
         if out is None:
             print("\n".join(texts.values()), end="")
             continue

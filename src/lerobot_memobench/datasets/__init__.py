@@ -3,5 +3,5 @@
 An episode is a `demonstration`, with its labels. A finished one is kept on disk while others are made (`staging`) and
 becomes part of a LeRobotDataset (`lerobot_format`). Episodes come from `recording` and `generation`, or from files in
 the published layout (`hdf5`, `convert`); `replay` and `validate` play them again, `describe` and `push` publish them,
-`lookup` finds frames for training.
+`frames` and `images` read frames for training.
 """

@@ -35,8 +35,9 @@ from lerobot_memobench.datasets.hdf5 import (
     unusable_on_error,
 )
 from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, Problem, check_destination
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING
+from lerobot_memobench.datasets.lerobot_format.manifest import Problem
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.restore import (
     ORIENTATIONS,
     orientation_of,
@@ -47,7 +48,7 @@ from lerobot_memobench.datasets.restore import (
 from lerobot_memobench.datasets.staging import (
     EpisodeStage,
     StagedJob,
-    episode_info,
+    check_destination,
     episodes_folder,
     finished_manifest,
     stage_failure,
@@ -484,5 +485,5 @@ class ConversionJob(StagedJob):
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
             demo = restore(task_of(file, found), found)
-            EpisodeRecord.model_validate(episode_info(demo))  # a bad value ends this episode, not the assembly of all
+            EpisodeRecord.of(demo)  # a bad value ends this episode, not the assembly of all
             return demo

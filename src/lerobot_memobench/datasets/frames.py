@@ -1,44 +1,26 @@
-"""Read frames of a dataset: phases, texts and recorded numbers by global index, and decoded images of a camera."""
+"""Frames of a dataset in main memory: phases, texts and recorded numbers by global index, and samples of them."""
 
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 from torch import Tensor
+from torch.utils.data import Dataset
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    OBJECTS,
-    check_clock,
-    naming_damage,
-    objects_column,
-    undamaged,
-    without_pattern,
-)
+from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
+from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import files_below
-from lerobot_memobench.protocol import OBS_PHASE, PROMPT
-
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
 
 _PLACE = ("index", "episode_index", "frame_index")
-TOLERANCE = 1e-4
-"""Largest difference of a decoded frame to its time, s."""
-FrameReader = Callable[[int, list[int]], Any]
-"""From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to another input of an encoder."""
-
-
-# --- phases and texts ---
 
 
 @dataclass
@@ -80,56 +62,25 @@ def read_frame_table(root: Path) -> FrameTable:
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    table = _read_columns(root, [OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()])
+    wanted = {*_PLACE, *CLOCK, "phase", HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
+    table = read_table(root / "data", lambda name: EARLIER_COLUMNS.get(name, name) in wanted)
+    check_clock(table.column_names, root)
+    table = table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names]).sort_by("index")
     there = set(table.column_names)
-    return FrameTable(
-        episodes=_episodes(root, table),
-        phase=(_numbers(table, OBS_PHASE) if OBS_PHASE in there else np.ones(len(table))).astype(np.uint8),
-        held=_numbers(table, HELD_COLUMN).astype(np.bool_) if HELD_COLUMN in there else np.zeros(len(table), np.bool_),
-        subgoals={level: _texts(table, name) for level, name in LEVEL_COLUMNS.items() if name in there},
-        memory=_texts(table, MEMORY_COLUMN) if MEMORY_COLUMN in there else None,
-    )
-
-
-def _read_columns(root: Path, optional: list[str]) -> pa.Table:
-    """Return each frame's indices, and the existing ones among the optional columns."""
-    files = files_below(root / "data", ".parquet")
-    if not files:
-        raise MemobenchError(f"{root} holds no frames: there is no parquet file below {root / 'data'}.")
-    with undamaged(files[0]):
-        present = pq.read_schema(files[0]).names
-    check_clock(present, root)
-    own = {EARLIER_COLUMNS.get(name, name): name for name in present}
-    kept = {name: own[name] for name in (*_PLACE, *optional) if name in own}
-    tables = []
-    for path in files:
-        with undamaged(path):
-            tables.append(pq.read_table(path, columns=[*kept.values()]))
-    table = pa.concat_tables(tables, promote_options="permissive").sort_by("index")
-    return table.rename_columns([*kept])
-
-
-def _episodes(root: Path, table: pa.Table) -> np.ndarray:
-    index, episode, frame = (_numbers(table, name) for name in _PLACE)
-    starts = np.flatnonzero(frame == 0)
-    expected = np.arange(len(index))
-    if not np.array_equal(index, expected) or not np.array_equal(
-        episode, np.searchsorted(starts, expected, "right") - 1
-    ):
+    number = {name: numbers(table.column(name)).reshape(-1) for name in {*_PLACE, OBS_PHASE, HELD_COLUMN} & there}
+    starts, expected = np.flatnonzero(number["frame_index"] == 0), np.arange(len(table))
+    episode = np.searchsorted(starts, expected, "right") - 1
+    if not (np.array_equal(number["index"], expected) and np.array_equal(number["episode_index"], episode)):
         raise MemobenchError(
             f"The frames of {root} are not numbered 0, 1, 2, ... episode by episode; write the dataset again."
         )
-    return np.append(starts, len(index)).astype(np.int64)
-
-
-def _numbers(table: pa.Table, name: str) -> np.ndarray:
-    return np.asarray(table.column(name).to_pylist()).reshape(-1)
-
-
-def _texts(table: pa.Table, name: str) -> list[str]:
-    """Return a column of texts. Rows are strings or lists of one string; a missing one is empty."""
-    values = table.column(name).to_pylist()
-    return [(value[0] if isinstance(value, list) else value) or "" for value in values]
+    return FrameTable(
+        episodes=np.append(starts, len(table)).astype(np.int64),
+        phase=number.get(OBS_PHASE, np.ones(len(table))).astype(np.uint8),
+        held=number.get(HELD_COLUMN, np.zeros(len(table))).astype(np.bool_),
+        subgoals={level: texts(table.column(name)) for level, name in LEVEL_COLUMNS.items() if name in there},
+        memory=texts(table.column(MEMORY_COLUMN)) if MEMORY_COLUMN in there else None,
+    )
 
 
 def resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
@@ -319,11 +270,10 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
         MemobenchError: a column is missing, or frames are not numbered 0, 1, 2, ...
     """
     table = read_frame_table(root)
-    frames = int(table.episodes[-1])
     columns: dict[str, np.ndarray] = {}
-    for path in files_below(root / "data", ".parquet"):
-        with undamaged(path):
-            there = pq.read_schema(path).names
+    wanted = {"index", *names} | ({PRIVILEGED} if OBJECTS in names else set())
+    for _, part in tables_of(root / "data", wanted.__contains__):
+        there = part.column_names
         column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
         missing = [name for name in column_of.values() if name not in there]
         if missing:
@@ -331,94 +281,55 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
                 f"The dataset {root} has no column '{missing[0]}', which this policy learns from; generate it again "
                 "with this version, or train with --policy.perception=pixels and no --policy.detection_noise."
             )
-        with undamaged(path):
-            part = pq.read_table(path, columns=sorted({"index", *column_of.values()}))
         places = part.column("index").to_numpy()
-        for name in names:
-            numbers = _column_numbers(part.column(column_of[name]))
-            column = columns.setdefault(name, np.empty((frames, *numbers.shape[1:]), numbers.dtype))
-            column[places] = numbers
+        for name, given in column_of.items():
+            values = numbers(part.column(given))
+            column = columns.setdefault(name, np.empty((len(table.phase), *values.shape[1:]), values.dtype))
+            column[places] = values
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
 
 
-def _column_numbers(column: pa.ChunkedArray) -> np.ndarray:
-    """Return numbers (n,), or (n, d) of a column of lists of one length."""
-    if not (pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)):
-        return np.asarray(column.to_numpy())
-    return np.asarray(column.combine_chunks().flatten().to_numpy(zero_copy_only=False)).reshape(len(column), -1)
+# --- samples ---
 
 
-# --- images ---
+class SamplesInMemory(Dataset[dict[str, Any]]):
+    """LeRobot's samples by their rows, from columns in main memory, without pictures.
 
-
-def frame_reader(root: Path, camera: str) -> FrameReader:
-    """Return the reader of a camera of the dataset in ``root``; it decodes the frames of a call in one sweep.
-
-    Raises:
-        MemobenchError: the dataset has no such camera or no images, or its metadata is damaged.
+    Args:
+        columns: name -> numbers (N, ...).
+        bounds: first rows of the stretches in which a sample takes its other steps, and N.
+        steps: name of a column -> its steps in a sample, relative to the sample's row.
+        tasks: instructions by ``task_index``.
+        texts: name -> further values (N,).
     """
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    with naming_damage(root):
-        meta = LeRobotDatasetMetadata(root.name, root=without_pattern(root))
-    if not meta.camera_keys:
-        raise MemobenchError(
-            f"{root} holds no pictures, which a detector and perception=pixels need; name a dataset with images, or "
-            "leave detector out with perception=objects"
-        )
-    if camera not in meta.camera_keys:
-        raise MemobenchError(
-            f"The dataset {root} has no camera '{camera}'; it has {', '.join(meta.camera_keys)}. "
-            "Choose one with --policy.memory_camera."
-        )
-    return (_video_reader if camera in meta.video_keys else _image_reader)(root, camera, meta)
+    def __init__(
+        self,
+        columns: Mapping[str, Tensor],
+        bounds: np.ndarray,
+        steps: Mapping[str, Sequence[int]],
+        tasks: Sequence[str],
+        texts: Mapping[str, pa.Array] | None = None,
+    ) -> None:
+        self._columns, self._texts, self._tasks = columns, texts or {}, tasks
+        self._bounds = torch.from_numpy(bounds)
+        self._steps = {name: torch.tensor([*own]) for name, own in steps.items()}
 
+    def __getitem__(self, row: int) -> dict[str, Any]:
+        return self.__getitems__([row])[0]
 
-def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
-    height, width, channels = meta.features[camera]["shape"]
-    decode = _decoder()
-    lock = threading.Lock()
-
-    def read(episode: int, numbers: list[int]) -> Tensor:
-        with lock:
-            row = meta.episodes[episode]
-            path = root / meta.get_video_file_path(episode, camera)
-        start = row[f"videos/{camera}/from_timestamp"]
-        with undamaged(path):
-            images = decode(path, [start + number / meta.fps for number in numbers])
-            return images.reshape(len(numbers), channels, height, width)
-
-    return read
-
-
-def _decoder() -> Callable[[Path, list[float]], Tensor]:
-    """Return a function from a video and times in it, s, to its frames."""
-    from lerobot.datasets import video_utils
-
-    backend = video_utils.get_safe_default_video_backend()
-    own = threading.local()
-
-    def decode(path: Path, times: list[float]) -> Tensor:
-        if backend != "torchcodec":
-            return video_utils.decode_video_frames(path, times, tolerance_s=TOLERANCE, backend=backend)
-        # LeRobot shares decoders within a process, but two threads must not use the same one.
-        if not hasattr(own, "decoders"):
-            own.decoders = video_utils.VideoDecoderCache(max_size=1)
-        return video_utils.decode_video_frames_torchcodec(path, times, TOLERANCE, decoder_cache=own.decoders)
-
-    return decode
-
-
-def _image_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
-    """Return the reader of a camera whose images are stored in the tables."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    dataset = LeRobotDataset(root.name, root=without_pattern(root))
-    starts = meta.episodes["dataset_from_index"]
-    lock = threading.Lock()
-
-    def read(episode: int, numbers: list[int]) -> Tensor:
-        with lock:
-            return torch.stack([dataset[starts[episode] + number][camera] for number in numbers])
-
-    return read
+    def __getitems__(self, rows: Sequence[int]) -> list[dict[str, Any]]:
+        """Return the samples of several rows, each column read once."""
+        at = torch.tensor(rows)
+        found: dict[str, Any] = {name: column[at] for name, column in self._columns.items() if name not in self._steps}
+        after = torch.searchsorted(self._bounds, at, right=True)
+        first, end = self._bounds[after - 1, None], self._bounds[after, None]
+        for name, steps in self._steps.items():
+            wanted = at[:, None] + steps
+            found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
+            if name in self._columns:
+                found[name] = self._columns[name][wanted.clamp(first, end - 1)]
+        parts: dict[str, Any] = {name: values.unbind() for name, values in found.items()}
+        parts |= {name: values.take(pa.array(rows)).to_pylist() for name, values in self._texts.items()}
+        parts["task"] = [self._tasks[number] for number in found["task_index"].tolist()]
+        return [dict(zip(parts, values, strict=True)) for values in zip(*parts.values(), strict=True)]

@@ -17,16 +17,11 @@ from lerobot_memobench.datasets.lerobot_format.card import (
     own_card,
     records_of,
 )
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    MANIFEST_FILE,
-    check_whole,
-    is_dataset,
-    naming_damage,
-    read_info,
-    read_manifest,
-    undamaged,
-)
+from lerobot_memobench.datasets.lerobot_format.damage import check_whole, naming_damage
+from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE, is_dataset
+from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, undamaged
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, write_file
 

@@ -30,15 +30,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, digest, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, check_whole, is_dataset, read_manifest
+from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
+from lerobot_memobench.datasets.lerobot_format.damage import check_whole
+from lerobot_memobench.datasets.lerobot_format.layout import STAGING, TOP_LEVEL, is_dataset
+from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, read_json, remove_drafts, short, write_file
+from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
-from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
+from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
@@ -218,24 +221,8 @@ class EpisodeStage:
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
     """Return the fields of an episode for meta/episodes, manifest and card."""
-    return {
-        "task_name": demo.task.name,
-        "memory_type": demo.task.memory_type,
-        "family": demo.task.family,
-        "language": demo.task.language,
-        "operations": demo.task.operations,
-        "seed": int(demo.seed),
-        "referent": demo.referent,
-        "variant": int(demo.variant),
-        "success": bool(demo.success),
-        "frames": len(demo),
-        "exec_start_index": int(demo.exec_start),
-        "key_frames": labels(demo).key_frames.tolist(),
-        "scene_hash": demo.scene_hash,
-        **{WORLD: LIBERO, "stand_ins": list(demo.stand_ins)},
-        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
-        "digest": digest(demo),
-    }
+    record = EpisodeRecord.of(demo).model_dump(exclude={"versions"})
+    return record | {"language": demo.task.language, "frames": len(demo)}
 
 
 def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
@@ -314,6 +301,23 @@ def flush_to_disk(paths: Iterable[Path]) -> None:
 
 
 # --- the run ---
+
+
+def check_destination(out: Path) -> None:
+    """Raise unless ``out`` is absent, empty, or holds only an unfinished run."""
+    if is_dataset(out):
+        raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    refuse_links(*(out / name for name in (STAGING, *TOP_LEVEL)))
+    # Files of an interrupted move next to the staging folder are replaced.
+    strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
+    if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
+        raise MemobenchError(
+            f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
+        )
 
 
 @contextlib.contextmanager

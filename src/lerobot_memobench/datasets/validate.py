@@ -18,29 +18,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, digest, labels, persistent_rows
-from lerobot_memobench.datasets.frames import FrameReader, frame_reader
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
+from lerobot_memobench.datasets.images import FrameReader, frame_reader
+from lerobot_memobench.datasets.lerobot_format.columns import (
+    EXECUTED_ACTION,
+    LANGUAGE,
+    OBJECTS,
+    check_clock,
+    image_key,
+    objects_column,
+)
+from lerobot_memobench.datasets.lerobot_format.damage import check_whole, expect, read_to_end
 from lerobot_memobench.datasets.lerobot_format.layout import (
     ADVICE,
-    EXECUTED_ACTION,
+    EPISODES,
     INFO_FILE,
-    LANGUAGE,
     MANIFEST_FILE,
-    OBJECTS,
     STATS_FILE,
-    Written,
-    check_clock,
-    check_whole,
     dataset_files,
-    episode_count,
-    expect,
-    image_key,
     is_dataset,
-    objects_column,
-    read_info,
-    read_manifest,
-    read_to_end,
 )
+from lerobot_memobench.datasets.lerobot_format.manifest import Written, read_manifest
 from lerobot_memobench.datasets.lerobot_format.reading import (
     Columns,
     EpisodePlace,
@@ -49,10 +47,12 @@ from lerobot_memobench.datasets.lerobot_format.reading import (
     list_episodes,
     read_episode,
 )
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, read_table
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
-from lerobot_memobench.io import check_fetched, cut, file_hash, files_below, refusing
+from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
@@ -230,14 +230,28 @@ def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Che
 
 def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) -> str | None:
     episode = read_episode(folder, index)
-    if episode.seed < 0:
+    if episode.record.seed < 0:
         return "it has no seed, so its scene cannot be made again"
-    task, images = (tasks or {}).get(episode.task_name), images_of(folder, index)
+    task, images = (tasks or {}).get(episode.record.task_name), images_of(folder, index)
     found = replay(episode, task=task, images=images)
     return None if found is None else str(found)
 
 
 # --- files ---
+
+
+def episode_count(folder: Path) -> int:
+    """Return the number of episodes of the dataset in ``folder``, by ``meta/info.json`` and ``meta/episodes``.
+
+    Raises:
+        MemobenchError: they cannot be read, or disagree.
+    """
+    count, rows = int(read_info(folder)["total_episodes"]), len(read_table(folder / EPISODES, "episode_index".__eq__))
+    if rows != count:
+        raise MemobenchError(
+            f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
+        )
+    return count
 
 
 def check_file(path: Path, written: Written | None) -> str | None:
@@ -366,19 +380,21 @@ def replay(
         MemobenchError: there is no such task, or the actions were removed.
     """
     if isinstance(recorded, Demonstration):
-        task, start, wanted, executed, held = recorded.task, 0, recorded.actions, recorded.applied, recorded.held
+        record, task, start = EpisodeRecord.of(recorded), recorded.task, 0
+        wanted, executed, held = recorded.actions, recorded.applied, recorded.held
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
-        check_world(recorded.world, "the episode")
-        task, start = (task or get_task(recorded.task_name)).variant(recorded.variant), recorded.start
+        record, start = recorded.record, recorded.start
+        check_world(record.world, "the episode")
+        task = (task or get_task(record.task_name)).variant(record.variant)
         columns, whole = recorded.columns, recorded.whole
         if "action" not in columns:
             raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
         wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
         held = columns.get(HELD_COLUMN)
-    watch = _ImageCheck(recorded.exec_start, len(wanted), images)
-    again = resimulate(task, recorded.seed, executed, recorded.exec_start, watch, held)
-    again = replace(again, referent=recorded.referent, variant=recorded.variant)
+    watch = _ImageCheck(record.exec_start_index, len(wanted), images)
+    again = resimulate(task, record.seed, executed, record.exec_start_index, watch, held)
+    again = replace(again, referent=record.referent, variant=record.variant)
     if not np.array_equal(wanted, executed):
         again = replace(again, actions=wanted, executed=again.actions)
     found = _whole_difference(whole, _whole(again))
@@ -506,18 +522,7 @@ def _columns(demo: Demonstration, objects: str) -> Columns:
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:
-    found = labels(demo)
-    return {
-        "memory_type": demo.task.memory_type,
-        "family": demo.task.family,
-        "operations": demo.task.operations,
-        "success": demo.success,
-        "key_frames": found.key_frames.tolist(),
-        "scene_hash": demo.scene_hash,
-        "fixture_poses": {name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
-        "language_persistent": persistent_rows(found),
-        "digest": digest(demo),
-    }
+    return EpisodeRecord.of(demo).determined() | {LANGUAGE: persistent_rows(labels(demo))}
 
 
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:

@@ -6,10 +6,10 @@ control (`controls`) are that control: the setting may differ, and the report ex
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,6 @@ from lerobot_memobench.evaluation.metrics import (
     varies,
 )
 from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
-from lerobot_memobench.evaluation.report_tables import inputs_phrase
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     PERMUTATIONS,
@@ -52,7 +51,6 @@ from lerobot_memobench.evaluation.statistics import (
 from lerobot_memobench.evaluation.tables import (
     NOT_APPLICABLE,
     Cell,
-    Count,
     Name,
     Numbers,
     Report,
@@ -76,16 +74,31 @@ Pair = tuple[Record, Record]
 # --- pairs of rollouts ---
 
 
-def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
-    """Return the episodes that both hold: same task, number and referent; under different salts, same variant too.
+def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
+    """Return the episodes that both hold; raise where a setting differs that ``allow`` lacks, naming all of them."""
+    for name in allow:
+        if name not in ALLOWED:
+            raise MemobenchError(
+                f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
+            )
+    unlike = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
+    names = [each.split(":")[0] for each in unlike]
+    pairs = _common_episodes(a, b, {*allow, *names})
+    unlike_episodes = _unlike_episodes(pairs, {*allow, *names})
+    if unlike or unlike_episodes:
+        names += unlike_episodes
+        options = " ".join(f"--allow {name}" for name in names)
+        reasons = "; ".join([*unlike, *unlike_episodes.values(), *other_physics(a, b)])
+        raise MemobenchError(
+            f"{a.folder} and {b.folder} are not of the same episodes under one protocol "
+            f"({reasons}), so their difference is not the policies' alone; evaluate again"
+            + (f", or name the settings that are meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
+        )
+    return pairs
 
-    Args:
-        allow: which of `ALLOWED` may differ.
 
-    Raises:
-        MemobenchError: there are none, or a pair differs in its checkpoints.
-    """
-
+def _common_episodes(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
+    """Return the rollouts of the same task, number and referent; under different salts, of the same variant too."""
     redrawn = other_draws(a, b)
 
     def key(record: Record) -> tuple[str, int, str, int | None]:
@@ -108,7 +121,7 @@ def common_episodes(a: Run, b: Run, allow: Collection[str] = ()) -> list[Pair]:
     return pairs
 
 
-def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str]:
+def _unlike_episodes(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str]:
     """Return the first part of an episode's identity that differs in pairs: setting to allow -> a sentence.
 
     A missing field is no difference. Seeds that differ imply other scenes.
@@ -128,28 +141,37 @@ def unlike_pairs(pairs: Sequence[Pair], allow: Collection[str]) -> dict[str, str
     return {}
 
 
-# --- differences ---
+def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
+    meant = () if control is None else (control.setting, *control.also)
+    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=(*meant, "salt"))]
+    notes += other_draws(a, b) + other_physics(a, b) + other_hashes(a.protocol, b.protocol)
+    left = {run.name: len(run.records) - len(pairs) for run in (a, b)}
+    notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
+    if paused := [record["paused_steps"] for _, record in pairs if "paused_steps" in record]:
+        notes.append(f"a rollout of {b.name} holds {sum(paused) / len(paused):.1f} steps of pauses on average")
+    return notes + [f"{run.name}: {note}" for run in (a, b) for note in run.notes]
+
+
+# --- comparison ---
 
 Kind = Literal["average", "memory type", "suite", "task", "family"]
 
 
 @dataclass(frozen=True)
-class Difference:
-    """One metric of both evaluations over the same pairs. Rates are fractions.
+class Contrast:
+    """One metric of B against A over the same episodes. Rates are fractions.
 
     Attributes:
         kind: of the scope.
         scope: the average, a memory type or suite of LIBERO, a task, or a family of tasks.
         metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
         n: pairs.
-        a: rate of the first evaluation.
-        b: rate of the second.
+        a, b: rates of both evaluations.
         interval: 95 % interval of b − a.
         p: exact McNemar for outcomes of yes or no, sign-flip permutation else.
         exact: whether every assignment of signs was tried.
         detectable: smallest true difference that so many pairs show with 80 % power at 5 %; None for above 1.
-        only_a: pairs in which only the first succeeded (SR and prefix completion only).
-        only_b: pairs in which only the second did (SR and prefix completion only).
+        only_a, only_b: pairs in which only one of both succeeded (SR and prefix completion only).
         adjusted: p after Holm over the tasks, None but for tasks.
         closed: share of the first's gap to 1 that the second closes; None where the comparison does not ask for it.
     """
@@ -183,7 +205,7 @@ class Comparison:
         a, b: their names.
         pairs: number of episodes.
         notes: warnings for the reader.
-        inputs: of each policy.
+        inputs: name of an evaluation -> inputs of its policy.
         headline: the report's first line.
         control: the control that they are, if any.
     """
@@ -191,9 +213,9 @@ class Comparison:
     a: str
     b: str
     pairs: int
-    differences: tuple[Difference, ...]
+    contrasts: tuple[Contrast, ...]
     notes: tuple[str, ...]
-    inputs: tuple[str, str]
+    inputs: Mapping[str, str]
     headline: str
     control: Control | None = None
 
@@ -225,16 +247,16 @@ def compare(
     allowed = {*allow, *([] if control is None or control.of_policy else [control.setting, *control.also])}
     if other_hashes(a.protocol, b.protocol):
         allowed.add(SCENES)
-    pairs = _like_pairs(a, b, allowed)
+    pairs = _paired(a, b, allowed)
     notes = tuple(_notes(a, b, pairs, control))
     a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
     return Comparison(
         a=a.name,
         b=b.name,
         pairs=len(pairs),
-        differences=tuple(_adjusted(list(_differences(pairs, control, seed, permutations)))),
+        contrasts=tuple(_contrasts(pairs, control, np.random.default_rng(seed), permutations)),
         notes=notes,
-        inputs=(policy_inputs(a.records), policy_inputs(b.records)),
+        inputs={run.name: policy_inputs(run.records) for run in (a, b)},
         headline=headline([a, b]),
         control=control,
     )
@@ -250,77 +272,45 @@ def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
             continue
 
 
-def _like_pairs(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
-    """Return the common episodes; raise where a setting differs that was not allowed, naming all of them."""
-    for name in allow:
-        if name not in ALLOWED:
-            raise MemobenchError(
-                f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
-            )
-    found = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
-    names = [one.split(":")[0] for one in found]
-    pairs = common_episodes(a, b, {*allow, *names})
-    unlike = unlike_pairs(pairs, {*allow, *names})
-    if found or unlike:
-        names += unlike
-        options = " ".join(f"--allow {name}" for name in names)
-        reasons = "; ".join([*found, *unlike.values(), *other_physics(a, b)])
-        raise MemobenchError(
-            f"{a.folder} and {b.folder} are not of the same episodes under one protocol "
-            f"({reasons}), so their difference is not the policies' alone; evaluate again"
-            + (f", or name the settings that are meant to differ: {options}" if set(names) <= set(ALLOWED) else "")
-        )
-    return pairs
-
-
-def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> list[str]:
-    """Return warnings for the reader: differing settings, episodes left out, gaps of the logs."""
-    meant = () if control is None else (control.setting, *control.also)
-    notes = [f"compared although {note}" for note in differences(a.protocol, b.protocol, ignore=(*meant, "salt"))]
-    notes += other_draws(a, b) + other_physics(a, b) + other_hashes(a.protocol, b.protocol)
-    left = {run.name: len(run.records) - len(pairs) for run in (a, b)}
-    notes += [f"{count_of(count, 'episode')} only in {name} left out" for name, count in left.items() if count]
-    if paused := [record["paused_steps"] for _, record in pairs if "paused_steps" in record]:
-        notes.append(f"a rollout of {b.name} holds {sum(paused) / len(paused):.1f} steps of pauses on average")
-    return notes + [f"{run.name}: {note}" for run in (a, b) for note in run.notes]
-
-
 # --- tasks and scopes ---
 
 
-@dataclass(frozen=True)
-class _Task:
-    """The pairs of one task.
+class _Sample(NamedTuple):
+    """A metric in the pairs of a task, (n, 2) in [0, 1], and its mean in each bootstrap draw, (`DRAWS`, 2)."""
 
-    Attributes:
-        values: metric -> its value in both rollouts of each pair, (n, 2) in [0, 1].
-        drawn: metric -> mean of each bootstrap draw, (`DRAWS`, 2).
-    """
+    values: Array
+    drawn: Array
+
+
+class _Task(NamedTuple):
+    """The pairs of one task; ``samples`` has the metrics that apply to it."""
 
     name: str
     memory_type: str
     family: str | None
-    values: Mapping[str, Array]
-    drawn: Mapping[str, Array]
+    samples: Mapping[str, _Sample]
 
 
 def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     partners = {id(mine): other for mine, other in pairs}
     rng = np.random.default_rng(0)
-    found = []
+    tasks = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
-        values = {metric: _values(both, metric) for metric in METRICS}
+        values = {metric: np.array([[value_of(r, metric) for r in pair] for pair in both], float) for metric in METRICS}
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
         scenes = _scenes(group)
-        episodes = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
+        drawn = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
+        samples = {
+            metric: _Sample(value, value[drawn].mean(axis=1))
+            for metric, value in values.items()
+            if not np.isnan(value).any()  # does not apply
+        }
         family = get_task(name).family if suite_of(name) in SUITES else None
-        applicable = {metric: value for metric, value in values.items() if value is not None}
-        drawn = {metric: value[episodes].mean(axis=1) for metric, value in applicable.items()}
-        found.append(_Task(name, str(group[0]["memory_type"]), family, applicable, drawn))
-    return found
+        tasks.append(_Task(name, str(group[0]["memory_type"]), family, samples))
+    return tasks
 
 
 def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
@@ -332,18 +322,8 @@ def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
     return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
 
 
-def _values(pairs: Sequence[Pair], metric: str) -> Array | None:
-    """Return a metric in both rollouts of each pair, (n, 2), None where it does not apply to the task."""
-    values = [[value_of(record, metric) for record in pair] for pair in pairs]
-    return None if any(None in pair for pair in values) else np.array(values, dtype=float)
-
-
-Scope = tuple[Kind, str, list[list[_Task]]]
-"""Kind, name, and groups of tasks: a rate is the mean over groups of means over their tasks."""
-
-
-def _scopes(tasks: Sequence[_Task]) -> list[Scope]:
-    """Return the average, each memory type or suite of LIBERO, each task and each family, in the report's order.
+def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]:
+    """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups.
 
     Of a single suite of LIBERO, the average is that of the suite. LIBERO's tasks have no families.
     """
@@ -363,92 +343,77 @@ def _scopes(tasks: Sequence[_Task]) -> list[Scope]:
 # --- one metric in one scope ---
 
 
-def _differences(pairs: Sequence[Pair], control: Control | None, seed: int, permutations: int) -> Iterator[Difference]:
-    rng = np.random.default_rng(seed)
+def _contrasts(
+    pairs: Sequence[Pair], control: Control | None, rng: np.random.Generator, permutations: int
+) -> list[Contrast]:
     closes = control is not None and control.gap_closed
-    tasks = _tasks(pairs, by_checkpoint=control is not None and control.by_checkpoint)
-    for kind, scope, groups in _scopes(tasks):
-        metrics = groups[0][0].values if kind == "task" else METRICS
-        for metric in metrics:
-            applicable = [there for group in groups if (there := [task for task in group if metric in task.values])]
-            if applicable:
-                found = _difference(kind, scope, metric, applicable, rng, permutations)
-                yield replace(found, closed=_closed(found, metric, applicable)) if closes else found
+    contrasts = []
+    for kind, scope, groups in _scopes(_tasks(pairs, by_checkpoint=control is not None and control.by_checkpoint)):
+        for metric in groups[0][0].samples if kind == "task" else METRICS:
+            samples = [[task.samples[metric] for task in group if metric in task.samples] for group in groups]
+            if applicable := [group for group in samples if group]:
+                contrasts.append(_contrast(kind, scope, metric, applicable, rng, permutations, closes))
+    for metric in METRICS:
+        of_tasks = [k for k, each in enumerate(contrasts) if each.metric == metric and each.kind == "task"]
+        for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
+            contrasts[k] = replace(contrasts[k], adjusted=p)
+    return contrasts
 
 
-def _difference(
-    kind: Kind, scope: str, metric: str, groups: list[list[_Task]], rng: np.random.Generator, permutations: int
-) -> Difference:
-    """Return the difference of one metric in one scope, weighted as the report weights."""
-    pairs, weights = _weighted(groups, metric)
-    d = pairs[:, 1] - pairs[:, 0]
-    draws = _drawn(groups, metric)
+def _contrast(
+    kind: Kind,
+    scope: str,
+    metric: str,
+    groups: list[list[_Sample]],
+    rng: np.random.Generator,
+    permutations: int,
+    closes: bool,
+) -> Contrast:
+    """Return the contrast of one metric in one scope, weighted as the report weights."""
+    values = [sample.values for group in groups for sample in group]
+    sizes = [len(groups) * len(group) * len(sample.values) for group in groups for sample in group]
+    before, after = np.concatenate(values).T
+    weights = np.concatenate([np.full(len(value), 1 / size) for value, size in zip(values, sizes, strict=True)])
+    drawn = np.mean([np.mean([sample.drawn for sample in group], axis=0) for group in groups], axis=0)
+    # Summed as the report sums, so that both print the same digits.
+    a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
+    d = after - before
+    only_a = only_b = None
     if metric in METRICS[1:]:
-        only_a = only_b = None
         p, exact = sign_flip(d, weights, rng, permutations)
     else:
         only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
         p = mcnemar(only_a, only_b)
-    return Difference(
+    return Contrast(
         kind=kind,
         scope=scope,
         metric=metric,
         n=len(d),
-        a=_rate(groups, metric, 0),
-        b=_rate(groups, metric, 1),
-        interval=difference_interval(draws[:, 1] - draws[:, 0], pairs[:, 0], pairs[:, 1], weights),
+        a=a,
+        b=b,
+        interval=difference_interval(drawn[:, 1] - drawn[:, 0], before, after, weights),
         p=p,
         exact=exact,
         detectable=detectable(d, weights),
         only_a=only_a,
         only_b=only_b,
+        closed=_closed(a, b, drawn, newcombe(before, after, weights)) if closes else None,
     )
-
-
-def _weighted(groups: list[list[_Task]], metric: str) -> tuple[Array, Array]:
-    """Return all pairs of groups of tasks, (n, 2), and the weight of each, (n,)."""
-    parts = [
-        (values := task.values[metric], np.full(len(values), 1 / (len(groups) * len(group) * len(values))))
-        for group in groups
-        for task in group
-    ]
-    return np.concatenate([pairs for pairs, _ in parts]), np.concatenate([weights for _, weights in parts])
-
-
-def _drawn(groups: list[list[_Task]], metric: str) -> NDArray[np.float64]:
-    """Return the rates of each bootstrap draw, (`DRAWS`, 2)."""
-    return np.mean([np.mean([task.drawn[metric] for task in group], axis=0) for group in groups], axis=0)
-
-
-def _rate(groups: list[list[_Task]], metric: str, side: int) -> float:
-    """Return a rate summed as the report sums it, so that both print the same digits."""
-    return _mean([_mean([_mean(task.values[metric][:, side].tolist()) for task in group]) for group in groups])
 
 
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def _closed(found: Difference, metric: str, groups: list[list[_Task]]) -> Estimate:
+def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
     """Return the share of the gap that is closed, with its interval where the gap seldom vanishes in the draws."""
-    value, draws = gap_closed(found.a, found.b), _drawn(groups, metric)
-    shares = [share for a, b in draws.tolist() if (share := gap_closed(a, b)) is not None]
-    if value is None or len(shares) <= 0.9 * len(draws):
+    value = gap_closed(a, b)
+    shares = [share for pair in drawn.tolist() if (share := gap_closed(*pair)) is not None]
+    if value is None or len(shares) <= 0.9 * len(drawn):
         return Estimate(value)
-    pairs, weights = _weighted(groups, metric)
-    least, most = (bound / (1.0 - found.a) for bound in newcombe(pairs[:, 0], pairs[:, 1], weights))
+    least, most = (bound / (1.0 - a) for bound in bounds)
     low, high = percentiles(np.array(shares))
     return Estimate(value, min(low, least), min(max(high, most), 1.0))
-
-
-def _adjusted(rows: Sequence[Difference]) -> list[Difference]:
-    """Adjust the p-values of the tasks, per metric, for their number."""
-    result = list(rows)
-    for metric in METRICS:
-        places = [k for k, row in enumerate(rows) if row.metric == metric and row.kind == "task"]
-        for k, p in zip(places, holm([rows[k].p for k in places]), strict=True):
-            result[k] = replace(result[k], adjusted=p)
-    return result
 
 
 # --- the report ---
@@ -467,28 +432,29 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(found: Comparison) -> Report:
+def comparison_report(comparison: Comparison) -> Report:
     """Return a comparison as tables and JSON values."""
-    section = replace(comparison_section(found), title="")
-    return Report(f"{found.title}: {found.headline}", (section,), comparison_data(found))
+    section = comparison_section(comparison)
+    title = f"{section.title}: {comparison.headline}"
+    return Report(title, [replace(section, title="")], comparison_data(comparison))
 
 
-def comparison_section(found: Comparison, overall: bool = False) -> Section:
+def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
     """Return the tables of a comparison, with a title.
 
     Args:
         overall: the average and memory types alone.
     """
-    kinds = {row.kind for row in found.differences}
-    tables = [_table(found, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
+    kinds = {each.kind for each in comparison.contrasts}
+    tables = [_table(comparison, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
     if MEMORY_TYPE not in kinds:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
-    sentence = f"{count_of(found.pairs, 'episode')} in both, paired by task, episode and referent."
-    meaning = [found.control.meaning] if found.control else []
-    return Section(found.title, tuple(tables), (sentence, *meaning, NOTE), found.notes)
+    sentence = f"{count_of(comparison.pairs, 'episode')} in both, paired by task, episode and referent."
+    meaning = [comparison.control.meaning] if comparison.control else []
+    return Section(comparison.title, tables, [sentence, *meaning, NOTE], comparison.notes)
 
 
-def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
+def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
     """Return a comparison as JSON values.
 
     Args:
@@ -496,86 +462,67 @@ def comparison_data(found: Comparison, overall: bool = False) -> dict[str, Any]:
     """
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
-        "a": found.a,
-        "b": found.b,
-        "control": found.control.setting if found.control else None,
-        "inputs": {found.a: found.inputs[0], found.b: found.inputs[1]},
-        "pairs": found.pairs,
-        "differences": [_entry(row) for row in found.differences if row.kind in kinds],
-        "notes": list(found.notes),
+        "a": comparison.a,
+        "b": comparison.b,
+        "control": comparison.control.setting if comparison.control else None,
+        "inputs": dict(comparison.inputs),
+        "pairs": comparison.pairs,
+        "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
+        "notes": list(comparison.notes),
     }
 
 
-def comparison_phrase(found: Comparison) -> str:
+def comparison_phrase(comparison: Comparison) -> str:
     """Return the change of the average success in words, for one line."""
-    success = found.differences[0]
-    return f"{found.title}: SR {_points(success.value, True)} {_interval(success)}"
+    success = comparison.contrasts[0]
+    return f"{comparison.title}: SR {_points(success.value, True)} {_interval(success)}"
 
 
-def comparison_csv(found: Comparison) -> str:
+def comparison_csv(comparison: Comparison) -> str:
     """Return all differences of a comparison as CSV, one a row."""
-    entries = [_entry(row) for row in found.differences]
-    header = list(dict.fromkeys(name for entry in entries for name in entry))
-    return csv_text([[entry.get(name) for name in header] for entry in entries], header)
+    return csv_text([_entry(row) for row in comparison.contrasts])
 
 
-def _table(found: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
-    rows = [row for row in found.differences if row.kind in kinds]
+def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
+    """Return a row per metric; only the first of a scope names it."""
+    rows = [row for row in comparison.contrasts if row.kind in kinds]
     of_tasks, closes = "task" in kinds, any(row.closed is not None for row in rows)
-    header = [
-        "task" if of_tasks else "scope",
-        "metric",
-        "pairs",
-        found.a,
-        found.b,
-        "difference",
-        "95 %",
-        "only one",
-        "p",
+    columns: list[tuple[str, Callable[[Contrast], Cell]]] = [
+        ("metric", lambda row: row.metric),
+        ("pairs", lambda row: row.n),
+        (comparison.a, lambda row: _points(row.a)),
+        (comparison.b, lambda row: _points(row.b)),
+        ("difference", lambda row: _points(row.value, True)),
+        ("95 %", lambda row: Numbers(_interval(row))),
+        ("only one", lambda row: Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}")),
+        ("p", lambda row: _p(row.p)),
+        *[("p (Holm)", lambda row: _p(row.adjusted))] * of_tasks,
+        ("detectable", lambda row: Numbers("> 100") if row.detectable is None else _points(row.detectable)),
+        *[("gap closed", lambda row: _share(row.closed))] * closes,
     ]
-    header += ["p (Holm)"] * of_tasks + ["detectable"] + ["gap closed"] * closes
     starts = [k for k, row in enumerate(rows) if k == 0 or rows[k - 1].scope != row.scope]
-    cells = tuple(_row(row, of_tasks, closes, k in starts) for k, row in enumerate(rows))
-    inputs = "; ".join(
-        f"{name}: {inputs_phrase(words)}" for name, words in zip((found.a, found.b), found.inputs, strict=True)
-    )
-    return with_ids(Table(key, title, tuple(header), cells, note=f"{inputs}.", rules=frozenset(starts) - {0}))
-
-
-def _row(row: Difference, of_tasks: bool, closes: bool, first: bool) -> tuple[Cell, ...]:
-    """Return the row of one metric; only the first of a scope names it."""
-    name: Cell = (Name(row.scope) if of_tasks else row.scope) if first else ""
-    return (
-        name,
-        row.metric,
-        Count(row.n),
-        _points(row.a),
-        _points(row.b),
-        _points(row.value, True),
-        Numbers(_interval(row)),
-        Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}"),
-        _p(row.p),
-        *[_p(row.adjusted)] * of_tasks,
-        Numbers("> 100") if row.detectable is None else _points(row.detectable),
-        *[_share(row.closed)] * closes,
-    )
+    names = [(Name(row.scope) if of_tasks else row.scope) if k in starts else "" for k, row in enumerate(rows)]
+    cells = [[name, *(cell(row) for _, cell in columns)] for name, row in zip(names, rows, strict=True)]
+    header = ["task" if of_tasks else "scope", *(name for name, _ in columns)]
+    note = "; ".join(f"{name}: policy inputs: {words}" for name, words in comparison.inputs.items())
+    return with_ids(Table(key, title, header, cells, note=f"{note}.", rules=starts[1:]))
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
     return Numbers(figure(value, signed).replace("-", "−"))
 
 
-def _interval(row: Difference) -> str:
+def _interval(row: Contrast) -> str:
     low, high = (_points(bound, True) for bound in row.interval)
     return f"[{low}, {high}]"
 
 
-def _share(found: Estimate | None) -> Numbers:
-    if found is None or found.value is None:
+def _share(share: Estimate | None) -> Numbers:
+    if share is None or share.value is None:
         return Numbers(NOT_APPLICABLE)
-    if found.low is None or found.high is None:
-        return _points(found.value)
-    return Numbers(f"{_points(found.value)} [{_points(found.low)}, {_points(found.high)}]")
+    if share.low is None or share.high is None:
+        return _points(share.value)
+    return Numbers(f"{_points(share.value)} [{_points(share.low)}, {_points(share.high)}]")
 
 
 def _p(value: float | None) -> Numbers:
@@ -584,7 +531,7 @@ def _p(value: float | None) -> Numbers:
     return Numbers("< 0.001" if value < 0.001 else f"{value:.3f}")
 
 
-def _entry(row: Difference) -> dict[str, Any]:
+def _entry(row: Contrast) -> dict[str, Any]:
     """Return a difference as JSON values; rates in per cent, p as they are."""
     number = libero_id(row.scope)
     entry = {

@@ -18,7 +18,7 @@ from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Recor
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report_tables import AVERAGE
 from lerobot_memobench.evaluation.tables import Cell, Section, Table
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import LEVELS
 
 LEAST_GAP = 0.01
@@ -56,8 +56,8 @@ class Control:
     def value_in(self, run: Run) -> Any:
         """Return the setting's value in an evaluation, the default where its log does not record it."""
         known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
-        found = known.get(self.setting, self.default)
-        return found if self.value in (None, found) else self.default
+        value = known.get(self.setting, self.default)
+        return value if self.value in (None, value) else self.default
 
 
 CONTROLS = (
@@ -183,34 +183,26 @@ def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
 
 def granularity_section(runs: Sequence[Run]) -> list[Section]:
     """Return the section of rates by subgoal level, [] unless the policies were taught with several levels."""
-    found = granularity(runs)
-    if not found:
+    levels = granularity(runs)
+    if not levels:
         return []
-    summaries = {run.name: run.summary for run in runs}
-    rows: tuple[tuple[Cell, ...], ...] = tuple(
-        (
-            name,
-            level,
-            *(summaries[name].average[metric] for metric in METRICS),
-            *(own.average[metric] for metric in PROCESS_METRICS),
-        )
-        for name, (level, own) in found.items()
-    )
+    averages = {run.name: run.summary.average for run in runs}
+    rows: list[list[Cell]] = [
+        [name, level, *averages[name].values(), *(own.average[metric] for metric in PROCESS_METRICS)]
+        for name, (level, own) in levels.items()
+    ]
     header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
     sentence = (
         f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
         f"level: {AVERAGE}, per cent, with Wilson's 95 % interval over rollouts."
     )
-    return [Section("Annotation granularity", (Table("granularity", "", header, rows),), (sentence,))]
+    return [Section("Annotation granularity", [Table("granularity", "", header, rows)], [sentence])]
 
 
 def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:
     """Return the rates of `granularity` as JSON values, per cent."""
     return {
-        name: {
-            "level": level,
-            "own_labels": {metric: percent(own.average[metric].value) for metric in METRICS},
-        }
+        name: {"level": level, "own_labels": {metric: percent(rate.value) for metric, rate in own.average.items()}}
         for name, (level, own) in granularity(runs).items()
     }
 
@@ -221,10 +213,10 @@ def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
     Raises:
         MemobenchError: a rollout has another number of checkpoints than its task.
     """
-    index, known = LEVELS.index(level), task_names(suite=None)
+    index = LEVELS.index(level)
     result: list[Record] = []
     for record in records:
-        if record["task"] not in known:
+        if suite_of(record["task"]) is None:
             result.append(record)
             continue
         labels = [checkpoint.operations_by_level[index] for checkpoint in get_task(record["task"]).checkpoints]

@@ -8,7 +8,7 @@ pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
-from lerobot_memobench.evaluation.tables import Cell, Count, Name, Numbers, Section, Table, figure, with_interval
+from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, figure, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.difficulty import DIFFICULTIES
@@ -62,7 +62,7 @@ class Evidence:
     effective: float
 
 
-class FoundEvidence(NamedTuple):
+class EvidenceRates(NamedTuple):
     """The rates of an evaluation.
 
     Attributes:
@@ -76,8 +76,7 @@ class FoundEvidence(NamedTuple):
     notes: list[str]
 
 
-@dataclass(frozen=True)
-class _Task:
+class _Task(NamedTuple):
     """Rates of `RATES` and `RELIABLE` per scene (S, 5), the scenes that are drawn (D, S), and permuted rates (D,)."""
 
     variants: int
@@ -87,28 +86,28 @@ class _Task:
     permuted: Array
 
 
-def ran_evidence(records: Sequence[Record]) -> bool:
-    """Return whether each scene was run with each variant, of a task that has several."""
-    return any(map(_has_choice, records))
+def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
+    """Return how often choices follow the evidence; scenes that were not run with every variant are left out.
 
-
-def _has_choice(record: Record) -> bool:
-    return "choice" in record and varies(record)
-
-
-def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
-    """Return how often choices follow the evidence; scenes that were not run with every variant are left out."""
+    None unless scenes of a task were run with several variants.
+    """
+    groups = _by_task(records)
+    if not groups:
+        return None
     rng = np.random.default_rng(0)
     tasks: dict[str, _Task] = {}
     types: dict[str, list[_Task]] = {}
     left_out, without_rate = 0, list[str]()
-    for name, group in by_task(filter(_has_choice, records)).items():
+    for name, group in groups.items():
         whole = _whole_scenes(group)
         left_out += len(group) - sum(map(len, whole))
         if not whole:
             without_rate.append(name)
             continue
-        tasks[name] = _task(group[0], whole, rng, draws)
+        values = np.array([_rates_of_scene(scene) for scene in whole])
+        drawn = rng.integers(len(whole), size=(DRAWS, len(whole)))
+        permuted = np.mean([_permuted(scene, rng) for scene in whole], axis=0)
+        tasks[name] = _Task(int(group[0]["variants"]), group[0].get("chance"), values, drawn, permuted)
         if tasks[name].chance is not None:
             types.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
     average = _rates(list(types.values())) if types else None
@@ -121,12 +120,17 @@ def evidence_of(records: Sequence[Record], draws: int = DRAWS) -> FoundEvidence:
             f"the average has {average.effective:.0f} effective scenes; with fewer than {ENOUGH} the interval of a "
             "perfect policy begins below 90 %: run more episodes, 36 of each task by default"
         )
-    return FoundEvidence(
+    return EvidenceRates(
         {name: _rates([[task]]) for name, task in tasks.items()},
         {name: _rates([group]) for name, group in types.items()},
         average,
         notes,
     )
+
+
+def _by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """Return the rollouts of tasks with several variants that record a choice, by task."""
+    return by_task(record for record in records if "choice" in record and varies(record))
 
 
 def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
@@ -135,16 +139,6 @@ def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
     for record in group:
         scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
     return [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
-
-
-def _task(first: Record, scenes: Sequence[Sequence[Record]], rng: np.random.Generator, draws: int) -> _Task:
-    return _Task(
-        variants=int(first["variants"]),
-        chance=first.get("chance"),
-        values=np.array([_rates_of_scene(scene) for scene in scenes]),
-        drawn=rng.integers(len(scenes), size=(draws, len(scenes))),
-        permuted=np.mean([_permuted(scene, rng, draws) for scene in scenes], axis=0),
-    )
 
 
 def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
@@ -156,17 +150,17 @@ def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
     return [float(rate) for rate in rates]
 
 
-def _permuted(scene: Sequence[Record], rng: np.random.Generator, draws: int) -> Array:
-    """Return the share of right answers in a scene (D,) when they are exchanged among variants of one instruction."""
+def _permuted(scene: Sequence[Record], rng: np.random.Generator) -> Array:
+    """Return the share of right answers in a scene, (D,), when answers to one instruction are exchanged."""
     instruction, goal = _alike(str(scene[0]["task"]))
-    right = np.zeros(draws)
+    right = np.zeros(DRAWS)
     groups: dict[Any, list[Record]] = {}
     for record in scene:
         groups.setdefault(instruction.get(record.get("variant") or 0), []).append(record)
     for group in groups.values():
         shown = np.array([goal.get(k := record.get("variant") or 0, k) for record in group])
         chosen = np.array([-1 if (k := record["choice"]) is None else goal.get(k, k) for record in group])
-        right += (rng.permuted(np.tile(chosen, (draws, 1)), axis=1) == shown).sum(axis=1)
+        right += (rng.permuted(np.tile(chosen, (DRAWS, 1)), axis=1) == shown).sum(axis=1)
     return right / len(scene)
 
 
@@ -222,61 +216,56 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 # --- the report ---
 
 
-def evidence_section(found: FoundEvidence) -> Section:
+def evidence_section(evidence: EvidenceRates) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
-    rows = [_row(name, each) for name, each in found.memory_types.items()]
-    tables = []
-    if found.average is not None:
-        rows.append(_row("average", found.average))
-        strong = frozenset({len(rows) - 1})
-        tables.append(Table("evidence", "", ("memory type", *header), tuple(rows), strong=strong))
-    of_tasks = tuple(_row(Name(name), each) for name, each in found.tasks.items())
-    tables.append(Table("evidence_tasks", "", ("task", *header), of_tasks))
-    return Section("Evidence", tuple(tables), (SENTENCE,), tuple(found.notes))
+    rows = [_row(name, each) for name, each in evidence.memory_types.items()]
+    of_tasks = [_row(Name(name), each) for name, each in evidence.tasks.items()]
+    tables = [Table("evidence_tasks", "", ("task", *header), of_tasks)]
+    if evidence.average is not None:
+        rows.append(_row("average", evidence.average))
+        tables.insert(0, Table("evidence", "", ("memory type", *header), rows, strong={len(rows) - 1}))
+    return Section("Evidence", tables, [SENTENCE], evidence.notes)
 
 
-def _row(name: str, found: Evidence) -> tuple[Cell, ...]:
-    cells = [_cell(found.rates[rate]) if rate in found.rates else None for rate in SHOWN]
-    return (name, Count(found.scenes), Numbers(figure(found.chance)), *cells, Numbers(f"{found.p:.2g}"))
+def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:
+    rates = [evidence.rates.get(name) for name in SHOWN]
+    cells = [None if each is None else Numbers(with_interval(each.value, each.low, each.high)) for each in rates]
+    return (name, evidence.scenes, Numbers(figure(evidence.chance)), *cells, Numbers(f"{evidence.p:.2g}"))
 
 
-def _cell(found: Estimate) -> Numbers:
-    return Numbers(with_interval(found.value, found.low, found.high))
-
-
-def evidence_data(found: FoundEvidence, records: Sequence[Record]) -> dict[str, Any]:
+def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[str, Any]:
     """Return the rates as JSON values, per cent, and of each task which variant was chosen how often."""
-    groups = by_task(filter(_has_choice, records))
+    groups = _by_task(records)
     return {
-        "average": None if found.average is None else _data(found.average),
-        "tasks": {name: {**_data(each), "choices": _choices(groups[name])} for name, each in found.tasks.items()},
-        "memory_types": {name: _data(each) for name, each in found.memory_types.items()},
+        "average": None if evidence.average is None else _data(evidence.average),
+        "tasks": {name: {**_data(each), "choices": _choices(groups[name])} for name, each in evidence.tasks.items()},
+        "memory_types": {name: _data(each) for name, each in evidence.memory_types.items()},
     }
 
 
 def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
     """Return variant that was asked for -> variant that was chosen, or "none" -> rollouts."""
-    found: dict[str, Counter[str]] = {}
+    choices: dict[str, Counter[str]] = {}
     for record in group:
         chosen = "none" if record["choice"] is None else str(record["choice"])
-        found.setdefault(str(record.get("variant")), Counter())[chosen] += 1
-    return {variant: dict(sorted(counts.items())) for variant, counts in sorted(found.items())}
+        choices.setdefault(str(record.get("variant")), Counter())[chosen] += 1
+    return {variant: dict(sorted(counts.items())) for variant, counts in sorted(choices.items())}
 
 
-def _data(found: Evidence) -> dict[str, Any]:
+def _data(evidence: Evidence) -> dict[str, Any]:
     rates: dict[str, Any] = {
         name: {"percent": percent(rate.value), "low": percent(rate.low), "high": percent(rate.high)}
-        for name, rate in found.rates.items()
+        for name, rate in evidence.rates.items()
     }
     rates.setdefault(RIGHT, None)
-    size = {"scenes": found.scenes, "effective_scenes": round(found.effective, 1), "variants": found.variants}
-    return {**size, "chance": percent(found.chance), "p": found.p, **rates}
+    size = {"scenes": evidence.scenes, "effective_scenes": round(evidence.effective, 1), "variants": evidence.variants}
+    return {**size, "chance": percent(evidence.chance), "p": evidence.p, **rates}
 
 
-def evidence_phrase(found: FoundEvidence) -> list[str]:
+def evidence_phrase(evidence: EvidenceRates) -> list[str]:
     """Return the average in words, for one line; [] where there is none."""
-    if found.average is None:
+    if evidence.average is None:
         return []
-    follows = figure(found.average.rates["follows"].value)
-    return [f"follows the evidence {follows} %, chance {figure(found.average.chance)} %"]
+    follows = figure(evidence.average.rates["follows"].value)
+    return [f"follows the evidence {follows} %, chance {figure(evidence.average.chance)} %"]

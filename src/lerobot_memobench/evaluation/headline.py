@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Sequence
 
 from lerobot_memobench.envs.episode_log import OMITTED, POLICY
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS, PICTURES
@@ -47,52 +47,42 @@ def policy_name(run: Run) -> str:
 
 def protocol_phrases(run: Run) -> list[str]:
     """Return suite, scenes, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
-    records, suites = run.records, ", ".join(run.suites)
+    records, suites, protocol = run.records, ", ".join(run.suites), run.protocol
+    own = run.card.get("settings", {}).get("env", {}).get("task_dir")
+    of_scenes = {key: of_all(records, key) for key in ("difficulty", "protocol", *PICTURES)}
+    missing, referents = stand_ins_of(records), sorted({str(record.get("referent", "fixed")) for record in records})
+    intervals = sorted({steps for record in records if (steps := record.get("replan_steps")) is not None})
+    controls = {name: protocol.get(name, OMITTED[name]) for name in CONTROLLED}
     return [
-        f"own tasks, suite={suites}"
-        if run.card.get("settings", {}).get("env", {}).get("task_dir")
-        else f"{suites} suite{'s' * (len(run.suites) > 1)}",
-        *(["scenes that version 0.2 modelled in code"] if of_all(records, WORLD) == FORMER else []),
-        *(
-            f"{key} {value}"
-            for key in ("difficulty", "protocol", *PICTURES)
-            if (value := of_all(records, key)) != OMITTED[key]
-        ),
-        *([count_of(len(missing), "missing scan")] if (missing := stand_ins_of(records)) else []),
-        *([] if run.suites[0] in LIBERO_SUITES else [_referent(records)]),
+        f"own tasks, suite={suites}" if own else f"{suites} suite{'s' * (len(run.suites) > 1)}",
+        *["scenes that version 0.2 modelled in code"] * (of_all(records, WORLD) == FORMER),
+        *(f"{key} {value}" for key, value in of_scenes.items() if value != OMITTED[key]),
+        *[count_of(len(missing), "missing scan")] * bool(missing),
+        *[f"referent {', '.join(referents)}"] * (run.suites[0] not in LIBERO_SUITES),
         *_seeds(run),
         extent_phrase(records),
-        *([] if run.missing is None else ["incomplete"]),
-        *_replan(records),
-        *(
-            f"{name}={str(run.protocol[name]).lower()}"
-            for name in CONTROLLED
-            if run.protocol.get(name, OMITTED[name]) != OMITTED[name]
-        ),
-        *([f"salt {salt}"] if (salt := run.protocol.get("salt")) else []),
-        *(["each scene with each variant"] if run.protocol.get("evidence") else []),
+        *["incomplete"] * (run.missing is not None),
+        *[f"replan interval {', '.join(map(str, intervals))}"] * bool(intervals),
+        *(f"{name}={str(value).lower()}" for name, value in controls.items() if value != OMITTED[name]),
+        *[f"salt {protocol.get('salt')}"] * bool(protocol.get("salt")),
+        *["each scene with each variant"] * bool(protocol.get("evidence")),
     ]
-
-
-def _referent(records: Sequence[Record]) -> str:
-    return f"referent {', '.join(sorted({str(record.get('referent', 'fixed')) for record in records}))}"
 
 
 def _seeds(run: Run) -> list[str]:
     """Return the seeds, and the split that they are of where it is not the paper's."""
-    found = sorted({record["seed"] for record in run.records if record.get("seed") is not None})
-    if not found:
+    logged = {record["seed"] for record in run.records if record.get("seed") is not None}
+    if not logged:
         return []
-    seeds = f"seeds {found[0]} to {found[-1]}" if len(found) > 1 else f"seed {found[0]}"
-    name = next((name for name, split in SPLITS.items() if found[0] in split and found[-1] in split), PAPER)
+    first, last = min(logged), max(logged)
+    seeds = f"seeds {first} to {last}" if len(logged) > 1 else f"seed {first}"
+    name = next((name for name, split in SPLITS.items() if first in split and last in split), PAPER)
     return [seeds if name == PAPER else f"{seeds} ({name})"]
 
 
 def extent_phrase(records: Sequence[Record]) -> str:
     """Return how many episodes there are of how many tasks, of a single one by its name."""
-    counts: dict[str, int] = {}
-    for record in records:
-        counts[record["task"]] = counts.get(record["task"], 0) + 1
+    counts = Counter(str(record["task"]) for record in records)
     low, high = min(counts.values()), max(counts.values())
     episodes = count_of(high, "episode") if low == high else f"{low} to {high} episodes"
     if len(counts) == 1:
@@ -100,20 +90,10 @@ def extent_phrase(records: Sequence[Record]) -> str:
     return f"{episodes} of each of {len(counts)} tasks"
 
 
-def _replan(records: Sequence[Record]) -> list[str]:
-    found = sorted({record["replan_steps"] for record in records if record.get("replan_steps") is not None})
-    return [f"replan interval {', '.join(map(str, found))}"] if found else []
-
-
 def inputs_of(run: Run) -> str:
     """Return the policy's inputs and, where there was a demonstration prompt, whether the policy observed it."""
-    return ", ".join([f"inputs: {policy_inputs(run.records)}", *_prompt(run.records, run.protocol)])
-
-
-def _prompt(records: Sequence[Record], protocol: Mapping[str, Any]) -> list[str]:
-    if protocol.get("demonstration_prompt") is False:
-        return ["no demonstration prompt"]
-    if not any(record.get("prompt_steps") and record.get("prompt_shown", True) is not None for record in records):
-        return []
-    prompt_in = protocol.get("prompt_in")
-    return [PROMPT_IN[prompt_in]] if prompt_in in PROMPT_IN else []
+    inputs, prompt_in = f"inputs: {policy_inputs(run.records)}", run.protocol.get("prompt_in")
+    if run.protocol.get("demonstration_prompt") is False:
+        return f"{inputs}, no demonstration prompt"
+    prompted = any(each.get("prompt_steps") and each.get("prompt_shown", True) is not None for each in run.records)
+    return f"{inputs}, {PROMPT_IN[prompt_in]}" if prompted and prompt_in in PROMPT_IN else inputs

@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
-from lerobot_memobench.evaluation.gaps import GROUPS, success_by_gap
-from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.evaluation.metrics import Rate, Record
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report_tables import outcomes
 from lerobot_memobench.io import draft_of
+from lerobot_memobench.tasks.catalogue import get_task, suite_of
+from lerobot_memobench.tasks.gap import gaps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -168,57 +169,51 @@ def bars(runs: Sequence[Run]) -> list[Bar]:
     ]
 
 
-def draw_outcomes(found: Sequence[Bar]) -> Figure:
+def draw_outcomes(rows: Sequence[Bar]) -> Figure:
     """Draw bars, those of one heading together."""
     from matplotlib.patches import Patch
 
-    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(found)]
-    places = list(accumulate(steps, initial=0.0))  # from the top
+    steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(rows)]
+    heights = list(accumulate(steps, initial=0.0))  # from the top
+    headings = ["", *(bar.heading for bar in rows)]
     with paper_style():
-        figure = new_figure(7.0, 1.35 + 0.27 * (places[-1] + 1))
+        figure = new_figure(7.0, 1.35 + 0.27 * (heights[-1] + 1))
         axis = figure.subplots()
-        for bar, place in zip(found, places, strict=True):
-            _draw_bar(axis, bar, place)
-        axis.set_ylim(places[-1] + 0.6, -0.6)
+        labels = []
+        for bar, height, previous in zip(rows, heights, headings, strict=False):
+            _draw_bar(axis, bar, height)
+            heading = "" if bar.heading == previous else textwrap.fill(bar.heading, HEADING)
+            labels.append("   ".join(part for part in (heading, literal(bar.name)) if part))
+        axis.set_ylim(heights[-1] + 0.6, -0.6)
         axis.set_xlim(0, 100)
         axis.set_xlabel("rollouts, %")
-        axis.set_yticks(places, [_label(found, k) for k in range(len(found))])
+        axis.set_yticks(heights, labels)
         axis.tick_params(axis="y", length=0)
         axis.spines["left"].set_visible(False)
-        there = {name for bar in found for name, count in bar.parts.items() if count}
+        counted = {name for bar in rows for name, count in bar.parts.items() if count}
         handles = {
             name.replace("_", " "): Patch(facecolor=colour, hatch=hatch, edgecolor=INK, lw=0.5)
             for name, (colour, hatch) in OUTCOMES.items()
-            if name in there
+            if name in counted
         }
         legend_below(figure, handles, 3)
         return figure
 
 
-def _draw_bar(axis: Any, bar: Bar, place: float) -> None:
+def _draw_bar(axis: Any, bar: Bar, height: float) -> None:
     left, rollouts = 0.0, sum(bar.parts.values())
     for outcome, count in bar.parts.items():
         width = 100 * count / rollouts
         colour, hatch = OUTCOMES[outcome]
-        axis.barh(place, width, 0.8, left, color=colour, hatch=hatch, edgecolor=INK, linewidth=0.5, zorder=2)
+        axis.barh(height, width, 0.8, left, color=colour, hatch=hatch, edgecolor=INK, linewidth=0.5, zorder=2)
         if width >= NARROWEST_LABEL:
             box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-            axis.text(left + width / 2, place, f"{width:.0f}", ha="center", va="center", size=7, zorder=3, bbox=box)
+            axis.text(left + width / 2, height, f"{width:.0f}", ha="center", va="center", size=7, zorder=3, bbox=box)
         left += width
-    axis.text(101, place, f"n = {rollouts:,}", ha="left", va="center", size=7, color=FAINT)
-
-
-def _label(found: Sequence[Bar], k: int) -> str:
-    bar = found[k]
-    first = k == 0 or found[k - 1].heading != bar.heading
-    heading = textwrap.fill(bar.heading, HEADING) if first else ""
-    return "   ".join(part for part in (heading, literal(bar.name)) if part)
+    axis.text(101, height, f"n = {rollouts:,}", ha="left", va="center", size=7, color=FAINT)
 
 
 # --- rates by replan interval ---
-
-Curve = Mapping[int, Rate]
-"""Replan interval, or place on an axis -> rate."""
 
 
 def draw_replan(runs: Sequence[Run]) -> Figure:
@@ -230,22 +225,22 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
     styles = {name: line_style(number, published=False) for number, name in enumerate(methods)}
     with paper_style():
         figure = new_figure(1.25 + 1.55 * len(metrics), 2.5)
-        for metric, place in zip(metrics, figure.subplots(1, len(metrics), squeeze=False)[0], strict=True):
-            for name, found in methods.items():
-                _draw_curve(place, found[metric], styles[name])
-            place.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
-            place.set_xlabel("replan interval, steps")
-            place.set_xticks(sorted({steps for found in methods.values() for steps in found[metric]}))
+        for metric, axis in zip(metrics, figure.subplots(1, len(metrics), squeeze=False)[0], strict=True):
+            for name, curves in methods.items():
+                _draw_curve(axis, curves[metric], styles[name])
+            axis.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
+            axis.set_xlabel("replan interval, steps")
+            axis.set_xticks(sorted({steps for curves in methods.values() for steps in curves[metric]}))
             # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
-            place.set_ylim(bottom=0)
-            place.set_ylim(top=min(102.0, max(10.0, place.get_ylim()[1])))
-            place.grid(axis="y", color=GRID, lw=0.5)
+            axis.set_ylim(bottom=0)
+            axis.set_ylim(top=min(102.0, max(10.0, axis.get_ylim()[1])))
+            axis.grid(axis="y", color=GRID, lw=0.5)
         figure.axes[0].set_ylabel("average, %")
         legend_below(figure, {name: Line2D([], [], **styles[name]) for name in methods}, 3)
         return figure
 
 
-def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
+def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
     """Return metric -> its average at each replan interval where it applies."""
     return {
         metric: {
@@ -257,39 +252,66 @@ def _curves(runs: Sequence[Run]) -> dict[str, Curve]:
     }
 
 
-def _draw_curve(place: Any, found: Curve, style: Mapping[str, Any]) -> None:
-    rates = list(found.values())
-    values = [math.nan if rate.value is None else 100 * rate.value for rate in rates]
-    intervals = [rate.interval for rate in rates if rate.interval is not None]
+def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) -> None:
+    """Draw rates over a replan interval, or another abscissa."""
+    values = [math.nan if rate.value is None else 100 * rate.value for rate in curve.values()]
+    intervals = [rate.interval for rate in curve.values() if rate.interval is not None]
     if intervals:
         low, high = ([100 * interval[k] for interval in intervals] for k in (0, 1))
-        place.fill_between(list(found), low, high, color=style["color"], alpha=0.15, lw=0, zorder=1)
-    place.plot(list(found), values, **style, lw=1.9 if intervals else 1.1, zorder=3, clip_on=False)
+        axis.fill_between(list(curve), low, high, color=style["color"], alpha=0.15, lw=0, zorder=1)
+    axis.plot(list(curve), values, **style, lw=1.9 if intervals else 1.1, zorder=3, clip_on=False)
 
 
 # --- success by gap ---
 
+EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
+GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
+"""Groups of gaps from cue to use (`tasks.gap`), control steps; the first group needs no memory over time."""
 
-def draw_gaps(found: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
+
+def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
+    """Return for each group of gaps with checkpoints how many were reached, and how many there are.
+
+    A checkpoint counts if all earlier ones were reached in order: only then its information had to be remembered.
+    """
+    samples = [sample for record in records for sample in _samples(record)]
+    reached = {group: [done for gap, done in samples if low <= gap < high] for group, (low, high) in GAPS.items()}
+    return {group: (sum(done), len(done)) for group, done in reached.items() if done}
+
+
+def _samples(record: Record) -> Iterator[tuple[int, bool]]:
+    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
+    if suite_of(record["task"]) is None:
+        return
+    task = get_task(record["task"])
+    for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
+        steps = 0 if gap is None else gap.median
+        reached = checkpoint.get("ordered_step") is not None
+        yield steps, reached
+        if not reached:
+            return
+
+
+def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
     """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals.
 
     Args:
-        found: name of an evaluation -> its `success_by_gap`.
+        by_gap: name of an evaluation -> its `success_by_gap`.
     """
     from matplotlib.lines import Line2D
 
-    groups = [group for group in GROUPS if any(group in each for each in found.values())]
-    styles = {name: line_style(number, published=False) for number, name in enumerate(found)}
+    groups = [group for group in GAPS if any(group in each for each in by_gap.values())]
+    styles = {name: line_style(number, published=False) for number, name in enumerate(by_gap)}
     with paper_style():
         figure = new_figure(5.0, 2.7)
-        place = figure.subplots()
-        for name, counts in found.items():
+        axis = figure.subplots()
+        for name, counts in by_gap.items():
             curve = {groups.index(group): Rate(done / count, count) for group, (done, count) in counts.items()}
-            _draw_curve(place, curve, styles[name])
-        place.set_xticks(range(len(groups)), groups)
-        place.set_xlabel("gap from cue to use, control steps")
-        place.set_ylabel("checkpoints reached, %")
-        place.set_ylim(0, 102)
-        place.grid(axis="y", color=GRID, lw=0.5)
-        legend_below(figure, {name: Line2D([], [], **styles[name]) for name in found}, 3)
+            _draw_curve(axis, curve, styles[name])
+        axis.set_xticks(range(len(groups)), groups)
+        axis.set_xlabel("gap from cue to use, control steps")
+        axis.set_ylabel("checkpoints reached, %")
+        axis.set_ylim(0, 102)
+        axis.grid(axis="y", color=GRID, lw=0.5)
+        legend_below(figure, {name: Line2D([], [], **styles[name]) for name in by_gap}, 3)
         return figure

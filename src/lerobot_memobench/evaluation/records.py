@@ -8,7 +8,7 @@ joined to one, whose average is the mean over suites.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -22,17 +22,17 @@ from lerobot_memobench.envs.episode_log import (
     POLICY,
     differences,
     has_log,
+    not_run,
     notes_on_not_run,
     read_episodes,
     read_log,
     with_omitted,
 )
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES, SETTINGS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreements
-from lerobot_memobench.evaluation.asked import check_lines, extent_of
-from lerobot_memobench.evaluation.evidence import FoundEvidence, evidence_of, ran_evidence
+from lerobot_memobench.evaluation.agreement import check_lines, disagreements, extent_of
+from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
@@ -41,46 +41,43 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 # --- the protocol ---
 
-CARD_FILE = EVALUATION_FILE
-
 
 def read_protocol(folder: str | Path) -> dict[str, Any]:
     """Return the protocol of the evaluation in ``folder``.
 
-    Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as asked for, or
-    as found in the log where no file records it; ``suite``, ``world``, ``protocol`` as far as they
-    are not the default; ``seed_base``, ``referent``,
-    ``demonstration_prompt``, ``prompt_in``, ``horizon``, ``replan_steps``, ``render`` as
-    far as known; ``inputs``, of the policy; ``policy``, the known facts of the policy ({} where no file records them).
+    Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as requested, or
+    as the log has them where no file records it; the known settings; ``policy``, the known facts of the policy ({}
+    where no file records them).
 
     Raises:
         MemobenchError: there is no evaluation in the folder.
     """
-    folder = Path(folder)
-    card = read_evaluation(folder)
+    # `read_runs` names problems of the log
+    return _protocol_of(read_evaluation(Path(folder)), lambda: read_episodes(folder, []))
+
+
+def _protocol_of(card: Mapping[str, Any], records: Callable[[], Sequence[Record]]) -> dict[str, Any]:
+    """Return the protocol of an evaluation by its card and, where this omits settings, by the records of its log."""
     protocol: dict[str, Any] = card.get("protocol", {})
     if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(protocol):
-        protocol = {**protocol_of_log(read_episodes(folder, [])), **protocol}  # `read_runs` names problems
+        protocol = {**protocol_of_log(records()), **protocol}
     return {**protocol, POLICY: card.get(POLICY) or protocol.get(POLICY) or {}}
 
 
 def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the protocol that a log shows; settings in which its episodes differ are lists."""
     numbers = (record["episode"] + 1 for record in records)
-    found: dict[str, Any] = {
-        "tasks": sorted({record["task"] for record in records}),
-        "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
-    }
     seeded = all(record.get("seed") is not None for record in records)
     values: dict[str, set[Any]] = {
         "seed_base": {seed_base(record) for record in records if seeded},
         **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", WORLD, "protocol", *PICTURES)},
         **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
     }
-    for key, distinct in values.items():
-        if distinct:
-            found[key] = distinct.pop() if len(distinct) == 1 else sorted(distinct, key=str)
-    return found
+    return {
+        "tasks": sorted({record["task"] for record in records}),
+        "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
+        **{key: sorted(each, key=str) if len(each) > 1 else each.pop() for key, each in values.items() if each},
+    }
 
 
 APART = ("suite", WORLD)
@@ -93,13 +90,12 @@ def of_all(records: Iterable[Mapping[str, Any]], key: str) -> Any:
     Raises:
         MemobenchError: they are of several.
     """
-    there = {record.get(key, OMITTED[key]) for record in records} or {OMITTED[key]}
-    if len(there) > 1:
+    values = {record.get(key, OMITTED[key]) for record in records} or {OMITTED[key]}
+    if len(values) > 1:
         raise MemobenchError(
-            f"the rollouts are of the {key}s {' and '.join(sorted(map(str, there)))}; report each {key} by itself"
+            f"the rollouts are of the {key}s {' and '.join(sorted(map(str, values)))}; report each {key} by itself"
         )
-    (found,) = there
-    return found
+    return values.pop()
 
 
 # --- evaluations ---
@@ -115,6 +111,7 @@ class Run:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
+        not_run: task -> episodes that could not be run.
         parts: evaluations of single suites of LIBERO that are joined in it.
     """
 
@@ -125,6 +122,7 @@ class Run:
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
     missing: str | None = None
+    not_run: Mapping[str, int] = field(default_factory=dict)
     parts: Sequence[Run] = ()
 
     @property
@@ -143,9 +141,9 @@ class Run:
         return summarise(self.records)
 
     @cached_property
-    def evidence(self) -> FoundEvidence | None:
+    def evidence(self) -> EvidenceRates | None:
         """How often choices follow the evidence, None where scenes were not run with each variant."""
-        return evidence_of(self.records) if ran_evidence(self.records) else None
+        return evidence_of(self.records)
 
     @cached_property
     def card(self) -> dict[str, Any]:
@@ -155,12 +153,10 @@ class Run:
     @cached_property
     def replan_steps(self) -> int | None:
         """The one interval of all rollouts; the policy's own where none was asked for; None where it is unknown."""
-        found = {record.get("replan_steps") for record in self.records}
-        if len(found) > 1:
-            return None
-        (steps,) = found
-        if steps is None:
-            steps = self.protocol[POLICY].get("settings", {}).get("n_action_steps")
+        logged = {record.get("replan_steps") for record in self.records}
+        if logged == {None}:
+            logged = {self.protocol[POLICY].get("settings", {}).get("n_action_steps")}
+        steps = logged.pop() if len(logged) == 1 else None
         return steps if isinstance(steps, int) else None
 
 
@@ -221,7 +217,7 @@ def _joined(parts: Sequence[Run]) -> Run:
                 "and each suite once; give the folders of each policy one name: A=FOLDER A=FOLDER B=FOLDER"
             )
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
-    protocol = {key: found[0] if found.count(found[0]) == len(parts) else found for key, found in values.items()}
+    protocol = {key: each[0] if each.count(each[0]) == len(parts) else each for key, each in values.items()}
     missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
     return replace(
         parts[0],
@@ -241,14 +237,14 @@ def unlike(runs: Sequence[Run]) -> list[str]:
     Replan intervals may differ: they are compared on purpose.
     """
     notes = []
+    first = runs[0]
     for run in runs[1:]:
-        first = runs[0].name
-        if found := differences(runs[0].protocol, run.protocol, extent=True, ignore=("replan_steps", "salt")):
+        if settings := differences(first.protocol, run.protocol, extent=True, ignore=("replan_steps", "salt")):
             notes.append(
-                f"{first} and {run.name} have different protocols ({'; '.join(found)}; the first value is that of "
-                f"{first}): do not compare their rates; `memobench compare` compares common episodes"
+                f"{first.name} and {run.name} have different protocols ({'; '.join(settings)}; the first value is that "
+                f"of {first.name}): do not compare their rates; `memobench compare` compares common episodes"
             )
-        notes += other_physics(runs[0], run) + other_hashes(runs[0].protocol, run.protocol) + other_draws(runs[0], run)
+        notes += other_physics(first, run) + other_hashes(first.protocol, run.protocol) + other_draws(first, run)
     return notes
 
 
@@ -288,36 +284,43 @@ def read_run(folder: str | Path, name: str | None = None, method: str = "") -> R
     Raises:
         MemobenchError: it has no rollouts, or a line contradicts the settings in its file.
     """
-    folder, notes = Path(folder), list[str]()
-    logged = read_log(folder, notes)
-    lines = asked_for(folder, logged)
+    notes = list[str]()
+    return run_of(Path(folder), read_log(folder, notes), notes, name, method)
+
+
+def run_of(
+    folder: Path, logged: list[dict[str, Any]], notes: list[str], name: str | None = None, method: str = ""
+) -> Run:
+    """Return the evaluation in a folder by all lines of its log, and the notes on reading them; see `read_run`."""
     card = read_evaluation(folder)
+    lines, extent, notes = requested_lines(folder, logged, card), extent_of(card, logged), [*notes]
     if len(lines) < len(logged):
         notes.append(f"{count_of(len(logged) - len(lines), 'rollout')} beyond those that were asked for left out")
-    if card.get("episodes") and (found := disagreements(card["episodes"], lines)):
-        notes.append(f"log and card disagree about {count_of(len(found), 'episode')}, the first: {found[0]}")
-    extent = extent_of(card, logged)
+    if card.get("episodes") and (unequal := disagreements(card["episodes"], lines)):
+        notes.append(f"log and card disagree about {count_of(len(unequal), 'episode')}, the first: {unequal[0]}")
     missing = None if extent is None else extent.missing(lines)
     notes += [*([] if missing is None else [missing]), *notes_on_not_run(lines)]
     records = [record for record in lines if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    return Run(
-        name or folder.name, method, folder, records, read_protocol(folder), [*notes, *notes_on(records)], missing
-    )
+    protocol = _protocol_of(card, lambda: [record for record in logged if "not_run" not in record])
+    unrun = {task: len(group) for task, group in not_run(lines).items()}
+    return Run(name or folder.name, method, folder, records, protocol, [*notes, *notes_on(records)], missing, unrun)
 
 
-def asked_for(folder: Path, lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def requested_lines(
+    folder: Path, lines: list[dict[str, Any]], card: Mapping[str, Any] | None = None
+) -> list[dict[str, Any]]:
     """Return the lines of a log to report: without episodes that the evaluation's file does not ask for.
 
     Raises:
         MemobenchError: a line contradicts the settings in the file.
     """
-    card = read_evaluation(folder)
+    card = read_evaluation(folder) if card is None else card
     check_lines(folder, card, lines)
     extent = extent_of(card, lines)
-    return lines if extent is None else [record for record in lines if extent.asks(record)]
+    return lines if extent is None else [record for record in lines if extent.includes(record)]
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -345,34 +348,26 @@ def folder_names(folders: Sequence[str | Path]) -> list[str]:
 
 
 def _with_methods(runs: Sequence[Run]) -> list[Run]:
-    """Name the methods of runs that were not given a name, and the runs of named methods after them."""
-    methods = _methods(runs)
-    result = []
-    for run, method in zip(runs, methods, strict=True):
-        name = run.name
-        if run.method:
-            name = method if methods.count(method) == 1 else f"{method} k={run.replan_steps}"
-        result.append(replace(run, name=name, method=method))
-    return result
-
-
-def _methods(runs: Sequence[Run]) -> list[str]:
-    """Return whose result each run is: the name that it was given, else its policy's, else its folder's."""
+    """Name methods as given, else by policy, else by folder; name the evaluations of given methods after these."""
     kinds = Counter(kind for kind, _ in {_policy(run) for run in runs if not run.method and run.protocol[POLICY]})
-    chosen = []
+    methods = []
     for run in runs:
         kind, digest = _policy(run)
         policy = kind if kinds[kind] == 1 else f"{kind} {digest[:HASH_DIGITS]}".strip()
-        chosen.append(run.method or (policy if run.protocol[POLICY] else run.name))
+        methods.append(run.method or (policy if run.protocol[POLICY] else run.name))
     # Where policies are unknown, or one has several results at the same interval, folders name the methods.
-    places = Counter((method, run.replan_steps) for run, method in zip(runs, chosen, strict=True))
-    repeated = {method for (method, _), count in places.items() if count > 1}
-    taken = {run.method for run in runs if run.method} & repeated
-    if taken:
+    results = Counter((method, run.replan_steps) for run, method in zip(runs, methods, strict=True))
+    repeated = {method for (method, _), count in results.items() if count > 1}
+    if given := {run.method for run in runs if run.method} & repeated:
         raise MemobenchError(
-            f"two evaluations named {min(taken)!r} have the same replan interval; give them names of their own"
+            f"two evaluations named {min(given)!r} have the same replan interval; give them names of their own"
         )
-    return [run.name if method in repeated else method for run, method in zip(runs, chosen, strict=True)]
+    methods = [run.name if method in repeated else method for run, method in zip(runs, methods, strict=True)]
+    names = [
+        run.name if not run.method else method if methods.count(method) == 1 else f"{method} k={run.replan_steps}"
+        for run, method in zip(runs, methods, strict=True)
+    ]
+    return [replace(run, name=name, method=m) for run, name, m in zip(runs, names, methods, strict=True)]
 
 
 def _policy(run: Run) -> tuple[str, str]:
@@ -384,11 +379,7 @@ def _policy(run: Run) -> tuple[str, str]:
 def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
     """Return method -> its runs, by replan interval, of the methods that were evaluated at several intervals."""
     methods: dict[str, list[Run]] = {run.method: [] for run in runs}
-    for run in runs:
+    for run in sorted(runs, key=lambda run: run.replan_steps or 0):
         if run.replan_steps is not None:
             methods[run.method].append(run)
-    return {
-        method: sorted(group, key=lambda run: run.replan_steps or 0)
-        for method, group in methods.items()
-        if len({run.replan_steps for run in group}) > 1
-    }
+    return {name: group for name, group in methods.items() if len({run.replan_steps for run in group}) > 1}

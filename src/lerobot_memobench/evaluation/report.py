@@ -13,21 +13,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import RenderableType
-
-from lerobot_memobench.envs.episode_log import POLICY, not_run, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import POLICY, read_log, write_episodes
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.metrics import (
-    Rate,
-    Row,
-    Summary,
-    percent,
-    report_values,
-)
-from lerobot_memobench.evaluation.records import Run, asked_for, read_run, sweeps, unlike
+from lerobot_memobench.evaluation.metrics import Rate, Row, percent, report_values
+from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
     failures_table,
@@ -37,11 +29,10 @@ from lerobot_memobench.evaluation.report_tables import (
     overview,
     pooled_sentence,
     prefix_table,
-    rates_table,
     sweep,
     tasks_table,
 )
-from lerobot_memobench.evaluation.tables import Report, Section, markdown, terminal_table
+from lerobot_memobench.evaluation.tables import Report, Section, markdown
 from lerobot_memobench.io import write_file
 
 REPORT_JSON = "report.json"
@@ -63,12 +54,13 @@ def write_report(directory: str | Path) -> Run:
     Raises:
         MemobenchError: see `read_run`.
     """
-    directory = Path(directory)
-    run = read_run(directory)
-    lines = read_log(directory, [])  # `read_run` has named the problems
+    directory, notes = Path(directory), list[str]()
+    lines = read_log(directory, notes)
+    run = run_of(directory, lines, notes)
     write_episodes(directory, lines)
-    unrun = {task: len(group) for task, group in not_run(asked_for(directory, lines)).items()}
-    figures = {**report_values(run.summary), **evidence_values(run), **({"not_run": unrun} if unrun else {})}
+    figures = {**report_values(run.summary), **evidence_values(run)}
+    if run.not_run:
+        figures["not_run"] = run.not_run
     if run.missing is not None:
         figures["missing"] = run.missing
     write_file(directory / REPORT_JSON, json.dumps(figures, indent=2) + "\n")
@@ -76,14 +68,9 @@ def write_report(directory: str | Path) -> Run:
     return run
 
 
-def table(summary: Summary) -> RenderableType:
-    """Return the table of SR, MSR, MUR, MCR per task, memory type and on average, for the terminal."""
-    return terminal_table(rates_table(summary))
-
-
 def evaluation_markdown(run: Run) -> str:
     """Return the report of one evaluation as Markdown."""
-    return markdown(Report(headline([run]), (_section(run), *_evidence(run))))
+    return markdown(Report(headline([run]), [_section(run), *_evidence(run)]))
 
 
 # --- documents ---
@@ -91,34 +78,29 @@ def evaluation_markdown(run: Run) -> str:
 
 def build(runs: Sequence[Run]) -> Report:
     """Return the report of one or several evaluations."""
-    found, controls = [], list(controls_among(runs))
+    sections, controls = [], list(controls_among(runs))
     if len(runs) > 1:
-        found.append(Section("Evaluations", (overview(runs), joined_table(runs)), notes=tuple(unlike(runs))))
-    found += [sweep(method, group) for method, group in sweeps(runs).items()]
-    found += [comparison_section(each, overall=True) for each in controls]
-    found += granularity_section(runs)
+        sections.append(Section("Evaluations", [overview(runs), joined_table(runs)], notes=unlike(runs)))
+    sections += [sweep(method, group) for method, group in sweeps(runs).items()]
+    sections += [comparison_section(each, overall=True) for each in controls]
+    sections += granularity_section(runs)
     for run in runs:
         section = _section(run)
         if len(runs) > 1:  # their rates by task are joined
             where = f"Evaluation in {', '.join(str(each.folder) for each in run.evaluations)}."
-            tables = tuple(table for table in section.tables if table.key != "tasks")
-            section = replace(section, title=run.name, tables=tables, sentences=(where, *section.sentences))
-        found += [section, *_evidence(run)]
-    return Report(headline(runs), tuple(found), report_data(runs, controls))
+            tables = [table for table in section.tables if table.key != "tasks"]
+            section = replace(section, title=run.name, tables=tables, sentences=[where, *section.sentences])
+        sections += [section, *_evidence(run)]
+    return Report(headline(runs), sections, report_data(runs, controls))
 
 
 def _section(run: Run) -> Section:
-    """Return the section of one evaluation, without a title."""
     summary = run.summary
     inputs = inputs_sentence(summary.inputs)
     prefixes = (prefix_table(summary),) if any(summary.prefix.values()) else ()
-    made = (memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary))
-    return Section(
-        "",
-        tuple(replace(each, note=f"{each.note} {inputs}".strip()) for each in made),
-        (pooled_sentence(summary),),
-        tuple(run.notes),
-    )
+    tables = (memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary))
+    noted = [replace(table, note=f"{table.note} {inputs}".strip()) for table in tables]
+    return Section("", noted, [pooled_sentence(summary)], run.notes)
 
 
 def _evidence(run: Run) -> list[Section]:
@@ -136,18 +118,17 @@ def evidence_values(run: Run) -> dict[str, Any]:
 
 def report_data(runs: Sequence[Run], controls: Sequence[Comparison]) -> dict[str, Any]:
     """Return the figures of one or several evaluations."""
-    found: dict[str, Any]
     if len(runs) == 1:
-        found = run_data(runs[0])
+        data = run_data(runs[0])
     else:
-        found = {"evaluations": {run.name: run_data(run) for run in runs}, "notes": unlike(runs)}
+        data = {"evaluations": {run.name: run_data(run) for run in runs}, "notes": unlike(runs)}
         if controls:
-            found["controls"] = [comparison_data(each, overall=True) for each in controls]
+            data["controls"] = [comparison_data(each, overall=True) for each in controls]
         if levels := granularity_data(runs):
-            found["granularity"] = levels
+            data["granularity"] = levels
     if swept := sweeps(runs):
-        found["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
-    return found
+        data["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
+    return data
 
 
 def run_data(run: Run) -> dict[str, Any]:
@@ -167,9 +148,7 @@ def run_data(run: Run) -> dict[str, Any]:
             "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
             "average": _intervals(summary.average),
         },
-        "ordered_prefix": {
-            name: [percent(rate.value) for rate in rates] for name, rates in summary.ordered_prefix.items()
-        },
+        "ordered_prefix": {name: [percent(each.value) for each in rs] for name, rs in summary.ordered_prefix.items()},
         "pooled": {
             "checkpoints": _pooled(summary.pooled_checkpoints),
             **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
@@ -181,11 +160,8 @@ def run_data(run: Run) -> dict[str, Any]:
 
 
 def _intervals(row: Row) -> dict[str, list[float | None] | None]:
-    return {metric: _interval(rate) for metric, rate in row.items()}
-
-
-def _interval(rate: Rate) -> list[float | None] | None:
-    return None if rate.interval is None else [percent(bound) for bound in rate.interval]
+    intervals = {metric: rate.interval for metric, rate in row.items()}
+    return {metric: None if bounds is None else [*map(percent, bounds)] for metric, bounds in intervals.items()}
 
 
 def _pooled(rate: Rate) -> dict[str, Any]:

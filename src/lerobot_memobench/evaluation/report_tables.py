@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
-from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, METRICS, SUITE, Rate, Row, Summary, percent, policy_inputs
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, SUITE, Rate, Row, Summary, percent, policy_inputs
 from lerobot_memobench.evaluation.records import Run, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
-    Count,
     Name,
     Numbers,
     PrefixRates,
@@ -23,13 +23,8 @@ from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 
 
-def inputs_phrase(words: str) -> str:
-    """Return a policy's inputs, of `rollouts.policy_inputs`, as a phrase."""
-    return f"policy inputs: {words}"
-
-
 def inputs_sentence(words: str) -> str:
-    """Return a policy's inputs, of `rollouts.policy_inputs`, as a sentence."""
+    """Return a policy's inputs, of `metrics.policy_inputs`, as a sentence."""
     return f"Policy inputs: {words}."
 
 
@@ -40,13 +35,11 @@ def pooled_sentence(summary: Summary) -> str:
         for metric, rate in summary.pooled.items()
         if metric != "SR" and rate.value is not None
     ]
-    overall = summary.pooled_checkpoints
-    if not overall.n:
-        return f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}."
-    return (
-        f"Pooled over all rollouts of all tasks: SR {figure(summary.pooled['SR'].value)}, "
-        f"checkpoints satisfied {figure(overall.value)} ({count_of(overall.n, 'record')}): {', '.join(parts)}."
-    )
+    sentence, overall = f"SR {figure(summary.pooled['SR'].value)}", summary.pooled_checkpoints
+    if overall.n:
+        records = count_of(overall.n, "record")
+        sentence += f", checkpoints satisfied {figure(overall.value)} ({records}): {', '.join(parts)}"
+    return f"Pooled over all rollouts of all tasks: {sentence}."
 
 
 def failure_line(summary: Summary) -> str:
@@ -72,31 +65,26 @@ HOW_TO_READ = {
 def rates_table(summary: Summary) -> Table:
     """Return one table of all tasks, each memory type's or suite's rates after them, and the average."""
     rows: list[tuple[Cell, ...]] = []
-    strong, rules = [], []
-    for memory_type, row in summary.memory_types.items():
-        if rows:
-            rules.append(len(rows))
-        names = _tasks_of(summary, memory_type)
+    strong, rules = set(), set()
+    for group, row in {**summary.memory_types, **summary.means}.items():
+        rules.add(len(rows))
+        names = _tasks_of(summary, group)
         rows += [rate_row(Name(name), summary.tasks[name]) for name in names]
-        strong.append(len(rows))
-        rows.append(rate_row(f"{memory_type} ({count_of(len(names), 'task')})", row))
-    for name, row in summary.means.items():
-        rules.append(len(rows))
-        strong.append(len(rows))
-        rows.append(rate_row(name, row))
+        strong.add(len(rows))
+        rows.append(rate_row(f"{group} ({count_of(len(names), 'task')})" if names else group, row))
     header = ("task", "n", *summary.average)
-    return with_ids(Table("rates", "", header, tuple(rows), strong=frozenset(strong), rules=frozenset(rules)))
+    return with_ids(Table("rates", "", header, rows, strong=strong, rules=rules - {0}))
 
 
 def memory_types_table(summary: Summary) -> Table:
     """Return one row per memory type or suite, and the average."""
     rows = [rate_row(name, row) for name, row in (summary.memory_types | summary.means).items()]
-    last = frozenset({len(summary.memory_types)})
+    last = {len(summary.memory_types)}
     return Table(
         "memory-types",
         f"Rates by {summary.grouping}",
         (summary.grouping, "n", *summary.average),
-        tuple(rows),
+        rows,
         note=HOW_TO_READ[summary.grouping],
         strong=last,
         rules=last,
@@ -107,19 +95,19 @@ def tasks_table(summary: Summary) -> Table:
     """Return one row per task."""
     names = list(summary.tasks)
     types = [summary.memory_type_of[name] for name in names]
-    rows = tuple(rate_row(Name(name), summary.tasks[name]) for name in names)
-    rules = frozenset(k for k in range(1, len(types)) if types[k] != types[k - 1])
+    rows = [rate_row(Name(name), summary.tasks[name]) for name in names]
+    rules = [k for k in range(1, len(types)) if types[k] != types[k - 1]]
     return with_ids(Table("tasks", "Rates by task", ("task", "n", *summary.average), rows, rules=rules))
 
 
 def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
     """Return a row of a table of rates: name, n, metrics."""
-    return (name, Count(row["SR"].n), *row.values())
+    return (name, row["SR"].n, *row.values())
 
 
 def prefix_table(summary: Summary) -> Table:
     """Return per task how many rollouts came as far as each checkpoint, in any order and in order."""
-    width = max((len(found) for found in summary.prefix.values()), default=0)
+    width = max(map(len, summary.prefix.values()), default=0)
     rows = []
     for name, plain in summary.prefix.items():
         cells: list[Cell] = [PrefixRates(*pair) for pair in zip(plain, summary.ordered_prefix[name], strict=True)]
@@ -129,11 +117,9 @@ def prefix_table(summary: Summary) -> Table:
         "prefix",
         "Prefix completion, in any order / in order",
         ("task", "operations", *(f"c{k + 1}" for k in range(width))),
-        tuple(rows),
-        note=(
-            "Rollouts in which a checkpoint and all before it were satisfied, at whatever steps / one after another, "
-            "per cent."
-        ),
+        rows,
+        note="Rollouts in which a checkpoint and all before it were satisfied, at whatever steps / one after another, "
+        "per cent.",
     )
 
 
@@ -163,24 +149,24 @@ def failures_table(summary: Summary) -> Table:
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
     for outcome in ("success", *summary.failures):
-        found = [Count(column[outcome]) for column in counts.values()]
-        rows.append((outcome.replace("_", " "), *found, Rate(found[0] / total, total)))
+        numbers = [column[outcome] for column in counts.values()]
+        rows.append((outcome.replace("_", " "), *numbers, Rate(numbers[0] / total, total)))
     note = FAILURES_NOTES[summary.grouping] + "".join(FURTHER_NOTES.get(name, "") for name in summary.failures)
     return Table(
         "failures",
         "Outcomes of rollouts",
         ("outcome", "rollouts", *list(counts)[1:], "of all"),
-        tuple(rows),
+        rows,
         note=note,
-        rules=frozenset({1}),
+        rules={1},
     )
 
 
 def outcomes(summary: Summary, names: Iterable[str]) -> dict[str, int]:
     """Return how the rollouts of some tasks ended: success, then every class of failure -> rollouts."""
     names = list(names)
-    found = {failure: sum(summary.failures_of[name].get(failure, 0) for name in names) for failure in summary.failures}
-    return {"success": sum(summary.tasks[name]["SR"].n for name in names) - sum(found.values()), **found}
+    failed = {failure: sum(summary.failures_of[name].get(failure, 0) for name in names) for failure in summary.failures}
+    return {"success": sum(summary.tasks[name]["SR"].n for name in names) - sum(failed.values()), **failed}
 
 
 def _tasks_of(summary: Summary, memory_type: str) -> list[str]:
@@ -199,93 +185,71 @@ NOTE = "inputs: of the policy; k: the replan interval."
 def overview(runs: Sequence[Run]) -> Table:
     """Return one row per evaluation; the note names the settings in which they differ."""
     columns = columns_of(runs)
-    rows = tuple(run_row(run, columns) for run in runs)
-    note, first = " ".join([NOTE, *unlike(runs)]), runs[0].summary
-    return wide_table(
-        "overview", "Evaluations", rows, note=note, best=best_in_columns(rows), columns=columns, metrics=first.average
-    )
+    rows = [run_row(run, columns) for run in runs]
+    note = " ".join([NOTE, *unlike(runs)])
+    wide = wide_columns(LEADING, columns, runs[0].summary.average)
+    return Table("overview", "Evaluations", rows=rows, note=note, best=best_in_columns(rows), **wide)
 
 
 def run_row(run: Run, columns: Sequence[str] = PAPER_COLUMNS) -> tuple[Cell, ...]:
-    """Return the row of an evaluation."""
+    """Return the row of an evaluation: its cells under `LEADING`, and `all_rates`."""
     return (run.name, run.summary.inputs, run.replan_steps, *all_rates(run.summary, columns))
 
 
 def all_rates(summary: Summary, columns: Sequence[str]) -> list[Rate]:
     """Return the metrics of memory types or suites and of the average, in the order of ``columns``."""
     absent = dict.fromkeys(summary.average, Rate(None, 0))
-    found = {**summary.memory_types, **dict.fromkeys(PAPER_COLUMNS[-1:] * len(summary.means), summary.average)}
-    return [rate for name in columns for rate in found.get(name, absent).values()]
+    rates = summary.memory_types | dict.fromkeys(PAPER_COLUMNS[-1:] * len(summary.means), summary.average)
+    return [rate for name in columns for rate in rates.get(name, absent).values()]
 
 
 def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
     """Return the groups of columns of a wide table: the paper's, or the suites of LIBERO and their average."""
     if runs[0].summary.grouping == MEMORY_TYPE:
         return PAPER_COLUMNS
-    there = {name for run in runs for name in run.summary.memory_types}
-    return tuple(name for name in GROUPS if name in there) + PAPER_COLUMNS[-1:] * (len(there) > 1)
+    suites = {name for run in runs for name in run.summary.memory_types}
+    return tuple(name for name in GROUPS if name in suites) + PAPER_COLUMNS[-1:] * (len(suites) > 1)
 
 
-def wide_table(
-    key: str,
-    title: str,
-    rows: tuple[tuple[Cell, ...], ...],
-    leading: tuple[str, ...] = LEADING,
-    note: str = NOTE,
-    strong: Iterable[int] = (),
-    rules: Iterable[int] = (),
-    best: frozenset[tuple[int, int]] = frozenset(),
-    columns: Sequence[str] = PAPER_COLUMNS,
-    metrics: Iterable[str] = METRICS,
-) -> Table:
-    """Return a table whose rows are some leading cells and then `all_rates`, under ``columns`` and ``metrics``."""
+def wide_columns(leading: tuple[str, ...], columns: Sequence[str], metrics: Iterable[str]) -> dict[str, Any]:
+    """Return header and groups of a table whose rows are leading cells, then ``metrics`` under each of ``columns``."""
     metrics = tuple(metrics)
-    return Table(
-        key,
-        title,
-        (*leading, *(metrics * len(columns))),
-        rows,
-        note=note,
-        groups=(*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns)),
-        strong=frozenset(strong),
-        rules=frozenset(rules),
-        best=best,
-        intervals=False,
-    )
+    groups = (*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns))
+    return {"header": (*leading, *metrics * len(columns)), "groups": groups, "intervals": False}
 
 
 def joined_table(runs: Sequence[Run]) -> Table:
     """Return one row per task, memory type and average, with the rates of all evaluations next to each other."""
     metrics = tuple(runs[0].summary.average)
     absent: Row = dict.fromkeys(metrics, Rate(None, 0))
+    summaries = [run.summary for run in runs]
     rows: list[tuple[Cell, ...]] = []
-    strong, rules = [], []
+    strong, rules = set(), set()
 
-    def add(name: Cell, found: Iterable[Row]) -> None:
-        each = list(found)
+    def add(name: str, sources: Iterable[Mapping[str, Row]]) -> None:
+        each = [source.get(name, absent) for source in sources]
         rows.append((name, *(row[metric] for metric in metrics for row in each)))
 
     for memory_type in GROUPS:
-        names = dict.fromkeys(name for run in runs for name in _tasks_of(run.summary, memory_type))
-        if not names:
-            continue
+        names = dict.fromkeys(name for each in summaries for name in _tasks_of(each, memory_type))
         for name in names:
-            add(Name(name), (run.summary.tasks.get(name, absent) for run in runs))
-        strong.append(len(rows))
-        add(memory_type, (run.summary.memory_types.get(memory_type, absent) for run in runs))
-        rules.append(len(rows))
-    for name in dict.fromkeys(name for run in runs for name in run.summary.means):
-        strong.append(len(rows))
-        add(name, (run.summary.means.get(name, absent) for run in runs))
+            add(Name(name), (each.tasks for each in summaries))
+        if names:
+            strong.add(len(rows))
+            add(memory_type, (each.memory_types for each in summaries))
+            rules.add(len(rows))
+    for name in dict.fromkeys(name for each in summaries for name in each.means):
+        strong.add(len(rows))
+        add(name, (each.means for each in summaries))
     table = Table(
         "joined",
         "Rates by task",
         ("task", *(run.name for _ in metrics for run in runs)),
-        tuple(rows),
+        rows,
         note="Per cent; – is not applicable. Intervals: in CSV, JSON and the report of each evaluation alone.",
         groups=(("", 1), *((metric, len(runs)) for metric in metrics)),
-        strong=frozenset(strong),
-        rules=frozenset(rules),
+        strong=strong,
+        rules=rules,
         intervals=False,
     )
     return with_ids(table)
@@ -296,9 +260,9 @@ def joined_table(runs: Sequence[Run]) -> Table:
 
 def sweep(method: str, runs: Sequence[Run]) -> Section:
     """Return the tables of one method at several replan intervals, and which interval is best for what."""
-    averages = tuple((run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs)
+    averages = [(run.replan_steps, *rate_row(None, run.summary.average)[1:]) for run in runs]
     columns = columns_of(runs)
-    types = tuple((run.replan_steps, *all_rates(run.summary, columns)) for run in runs)
+    types = [(run.replan_steps, *all_rates(run.summary, columns)) for run in runs]
     first = runs[0].summary
     inputs = inputs_sentence(policy_inputs([record for run in runs for record in run.records]))
     slug = "-".join("".join(c if c.isalnum() and c.isascii() else " " for c in method).split()) or "policy"
@@ -311,15 +275,13 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             note=f"{HOW_TO_READ[first.grouping]} {inputs}",
             best=best_in_columns(averages),
         ),
-        wide_table(
+        Table(
             f"replan-types-{slug}",
             f"{first.grouping.capitalize()}s by replan interval: {method}",
-            types,
-            leading=("replan interval",),
+            rows=types,
             note=inputs,
             best=best_in_columns(types),
-            columns=columns,
-            metrics=first.average,
+            **wide_columns(("replan interval",), columns, first.average),
         ),
     )
     best = [
@@ -331,15 +293,14 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
     notes = []
     if len({frozenset(run.summary.tasks) for run in runs}) > 1:
         notes.append("the intervals were not evaluated on the same tasks; their averages do not compare")
-    title, sentence = f"Replan sweep: {method}", f"Best replan interval by average: {', '.join(best)}."
-    return Section(title, tables, (sentence,), tuple(notes))
+    return Section(f"Replan sweep: {method}", tables, [f"Best replan interval by average: {', '.join(best)}."], notes)
 
 
 def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | None]:
     """Return the replan intervals with the highest average of a metric as printed, and that average."""
-    found = [(percent(run.summary.average[metric].value), run) for run in runs]
-    known = [value for value, _ in found if value is not None]
-    if not known:
+    values = [percent(run.summary.average[metric].value) for run in runs]
+    highest = max((value for value in values if value is not None), default=None)
+    if highest is None:
         return [], None
-    best = [run for value, run in found if value == max(known)]
+    best = [run for value, run in zip(values, runs, strict=True) if value == highest]
     return [run.replan_steps for run in best if run.replan_steps is not None], best[0].summary.average[metric]

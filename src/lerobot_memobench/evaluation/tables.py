@@ -7,7 +7,7 @@ import io
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import NamedTuple
@@ -32,10 +32,6 @@ class Name(str):
 
 class Numbers(str):
     """Figures written out; set flush right like figures."""
-
-
-class Count(int):
-    """A number of things; other integers are labels."""
 
 
 class PrefixRates(NamedTuple):
@@ -64,13 +60,13 @@ class Table:
 
     key: str
     title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    header: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
     note: str = ""
-    groups: tuple[tuple[str, int], ...] = ()
-    strong: frozenset[int] = frozenset()
-    rules: frozenset[int] = frozenset()
-    best: frozenset[tuple[int, int]] = frozenset()
+    groups: Sequence[tuple[str, int]] = ()
+    strong: Collection[int] = ()
+    rules: Collection[int] = ()
+    best: Collection[tuple[int, int]] = ()
     intervals: bool = True
 
     def __post_init__(self) -> None:
@@ -79,9 +75,23 @@ class Table:
                 raise ValueError(f"a row of the table {self.key!r} has {len(row)} cells for {len(self.header)} columns")
 
     @property
+    def names(self) -> list[str]:
+        """The name of each column after the title of its group."""
+        return [f"{title} {name}".lstrip() for title, name in zip(self.titles, self.header, strict=True)]
+
+    @property
     def titles(self) -> list[str]:
         """The title of the group over each column, "" for none."""
         return [title for title, span in self.groups for _ in range(span)] or [""] * len(self.header)
+
+    def text(self, cell: Cell, interval: str = " [{}–{}]", escape: Callable[[str], str] = str) -> str:
+        """Return a cell as text; ``interval`` is the format of an interval."""
+        if isinstance(cell, PrefixRates):
+            return escape(" / ".join(figure(rate.value) for rate in cell))
+        if not isinstance(cell, Rate):
+            return escape(NOT_APPLICABLE if cell is None else str(cell))
+        bounds = cell.interval if self.intervals else None
+        return escape(figure(cell.value)) + (interval.format(*map(figure, bounds)) if bounds else "")
 
     def is_text(self, column: int) -> bool:
         """Return whether a column holds text and is therefore set flush left."""
@@ -93,9 +103,9 @@ class Section:
     """Tables and sentences under one heading."""
 
     title: str
-    tables: tuple[Table, ...] = ()
-    sentences: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    tables: Sequence[Table] = ()
+    sentences: Sequence[str] = ()
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -103,7 +113,7 @@ class Report:
     """A report: sections, and the same figures as JSON values."""
 
     title: str
-    sections: tuple[Section, ...]
+    sections: Sequence[Section]
     data: Mapping[str, object] = field(default_factory=dict)
 
     @property
@@ -114,25 +124,12 @@ class Report:
 
 def figure(value: float | None, sign: bool = False) -> str:
     """Return a fraction as a percentage with one decimal."""
-    found = percent(value)
-    return NOT_APPLICABLE if found is None else f"{found:{'+' if sign else ''}.1f}"
+    return NOT_APPLICABLE if value is None else f"{percent(value):{'+' if sign else ''}.1f}"
 
 
 def with_interval(value: float | None, low: float | None, high: float | None) -> str:
     """Return a fraction and its interval as percentages: ``97.8 [95.2–99.0]``."""
     return f"{figure(value)} [{figure(low)}–{figure(high)}]"
-
-
-def _words(cell: Cell, interval: str | None, escape: Callable[[str], str] = str) -> str:
-    """Return a cell as text; ``interval`` is how an interval is written, None for not at all."""
-    if isinstance(cell, PrefixRates):
-        return escape(" / ".join(figure(rate.value) for rate in cell))
-    if not isinstance(cell, Rate):
-        return escape(NOT_APPLICABLE if cell is None else str(cell))
-    value = escape(figure(cell.value))
-    if interval is None or cell.interval is None:
-        return value
-    return value + interval.format(*map(figure, cell.interval))
 
 
 def with_ids(table: Table) -> Table:
@@ -143,21 +140,21 @@ def with_ids(table: Table) -> Table:
     return replace(
         table,
         header=("id", *table.header),
-        rows=tuple((Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)),
+        rows=[(Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)],
         groups=(("", 1), *table.groups) if table.groups else (),
-        best=frozenset((row, column + 1) for row, column in table.best),
+        best=[(row, column + 1) for row, column in table.best],
     )
 
 
-def best_in_columns(rows: tuple[tuple[Cell, ...], ...]) -> frozenset[tuple[int, int]]:
+def best_in_columns(rows: Sequence[Sequence[Cell]]) -> set[tuple[int, int]]:
     """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
-    found = set()
-    for column in range(len(rows[0]) if rows else 0):
-        printed = {k: percent(cell.value) for k, row in enumerate(rows) if isinstance(cell := row[column], Rate)}
-        known = [value for value in printed.values() if value is not None]
-        if len(printed) > 1 and known:
-            found |= {(k, column) for k, value in printed.items() if value == max(known)}
-    return frozenset(found)
+    best = set[tuple[int, int]]()
+    for column, cells in enumerate(zip(*rows, strict=True)):
+        printed = {row: percent(cell.value) for row, cell in enumerate(cells) if isinstance(cell, Rate)}
+        highest = max((value for value in printed.values() if value is not None), default=None)
+        if len(printed) > 1 and highest is not None:
+            best |= {(row, column) for row, value in printed.items() if value == highest}
+    return best
 
 
 # --- GitHub's Markdown ---
@@ -181,15 +178,13 @@ def markdown(report: Report) -> str:
 
 def markdown_table(table: Table) -> list[str]:
     """Return the lines of a table in GitHub's Markdown."""
-    header = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
-    rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(header)))
-    lines = [f"| {' | '.join(map(markdown_text, header))} |", f"|{rule}|"]
+    rule = "|".join("---" if table.is_text(column) else "---:" for column in range(len(table.header)))
+    lines = [f"| {' | '.join(map(markdown_text, table.names))} |", f"|{rule}|"]
     for index, row in enumerate(table.rows):
         cells = []
         for column, cell in enumerate(row):
-            interval = " [{}, {}]" if table.intervals else None
             code = isinstance(cell, Name) and re.fullmatch(r"[\w.+-]+", cell)
-            words = f"`{cell}`" if code else _words(cell, interval, markdown_text)
+            words = f"`{cell}`" if code else table.text(cell, " [{}, {}]", markdown_text)
             emphasised = (index in table.strong and isinstance(cell, str)) or (index, column) in table.best
             cells.append(f"**{words}**" if emphasised and words else words)
         lines.append(f"| {' | '.join(cells)} |")
@@ -306,7 +301,7 @@ def _latex_row(table: Table, index: int) -> list[str]:
     """Return the line of a row, after a rule where one is drawn."""
     cells = []
     for column, cell in enumerate(table.rows[index]):
-        words = _words(cell, r" {{\scriptsize [{}, {}]}}" if table.intervals else None, latex_text)
+        words = table.text(cell, r" {{\scriptsize [{}, {}]}}", latex_text)
         words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
         strong = index in table.strong or (index, column) in table.best
         cells.append(rf"\textbf{{{words}}}" if strong and words else words)
@@ -377,7 +372,7 @@ class Unbroken:
     def _under_names(self, room: int) -> RenderResult:
         """Yield each row in two lines: the cells up to the name, and the others below."""
         columns = self.table.columns
-        before, after = columns[: self.column + 1], columns[self.column + 1 :]
+        after = columns[self.column + 1 :]
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
         least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
         space = room - INDENT * len(after)
@@ -394,13 +389,10 @@ class Unbroken:
         if self.table.title:
             yield Text(str(self.table.title), style="italic")
         yield row([column.header for column in after], "bold")
-        cells = [list(column.cells) for column in columns]
-        for k in range(self.table.row_count):
-            yield Text(" ", no_wrap=True, overflow="ignore").join(
-                cell if isinstance(cell, Text) else Text(str(cell))
-                for cell in (cells[c][k] for c in range(len(before)))
-            )
-            yield row([cells[c][k] for c in range(len(before), len(columns))])
+        for cells in zip(*(column.cells for column in columns), strict=True):
+            names = [cell if isinstance(cell, Text) else Text(str(cell)) for cell in cells[: self.column + 1]]
+            yield Text(" ", no_wrap=True, overflow="ignore").join(names)
+            yield row(cells[self.column + 1 :])
         if self.table.caption:
             yield Text(str(self.table.caption))
 
@@ -432,9 +424,9 @@ def _terminal_row(table: Table, index: int) -> list[Text]:
     for column, cell in enumerate(table.rows[index]):
         best = (index, column) in table.best
         style = "bold" if best or index in table.strong else ""
-        text = _words(cell, " [{}–{}]" if table.intervals else None) + "*" * best
         whole = isinstance(cell, Name)
-        cells.append(Text(text, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
+        words = table.text(cell) + "*" * best
+        cells.append(Text(words, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
     return cells
 
 
@@ -459,10 +451,10 @@ def _in_parts(table: Table) -> list[Table]:
 
 def _least_width(table: Table, column: int) -> int:
     """Return the width of a column whose texts are broken between words and whose names are whole."""
-    interval = " [{}–{}]" if table.intervals else None
-    cells = [(row[column], _words(row[column], interval)) for row in table.rows]
-    named = any(isinstance(cell, Name) for cell, _ in cells)
-    texts = [text for _, text in cells] if named else [word for _, text in cells for word in text.split()]
+    cells = [row[column] for row in table.rows]
+    texts = [table.text(cell) for cell in cells]
+    if not any(isinstance(cell, Name) for cell in cells):
+        texts = [word for text in texts for word in text.split()]
     return max(map(len, [*table.header[column].split(), *texts]), default=0) + 2
 
 
@@ -470,29 +462,23 @@ def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
     return replace(
         table,
         title=title,
-        header=tuple(table.header[column] for column in chosen),
-        rows=tuple(tuple(row[column] for column in chosen) for row in table.rows),
-        groups=tuple((table.titles[column], 1) for column in chosen),
-        best=frozenset((row, chosen.index(column)) for row, column in table.best if column in chosen),
+        header=[table.header[column] for column in chosen],
+        rows=[[row[column] for column in chosen] for row in table.rows],
+        groups=[(table.titles[column], 1) for column in chosen],
+        best=[(row, chosen.index(column)) for row, column in table.best if column in chosen],
     )
 
 
 # --- JSON, CSV, and all formats ---
 
 
-def json_text(report: Report) -> str:
-    """Return the figures of a report as JSON."""
-    return json.dumps(report.data, indent=2) + "\n"
-
-
 WRITERS: Mapping[str, Callable[[Report], str]] = {
     "table": text,
     "markdown": markdown,
     "latex": latex,
-    "json": json_text,
-    "csv": lambda report: "\n".join(csv_tables(report).values()),
+    "json": lambda report: json.dumps(report.data, indent=2) + "\n",
 }
-"""Format -> its writer."""
+"""Format -> its writer; `csv_tables` writes one file per table."""
 
 
 def csv_tables(report: Report) -> dict[str, str]:
@@ -501,47 +487,42 @@ def csv_tables(report: Report) -> dict[str, str]:
     rows: dict[str, list[dict[str, object]]] = {}
     for section in report.sections:
         for table in section.tables:
-            whose = {"evaluation": section.title} if keys[table.key] > 1 else {}
-            rows.setdefault(table.key, []).extend({**whose, **row} for row in _csv_rows(table))
-    found = {}
-    for key, members in rows.items():
-        header = list(dict.fromkeys(name for row in members for name in row))
-        found[key] = csv_text([[row.get(name) for name in header] for row in members], header)
-    return found
+            evaluation = {"evaluation": section.title} if keys[table.key] > 1 else {}
+            rows.setdefault(table.key, []).extend({**evaluation, **row} for row in _csv_rows(table))
+    return {key: csv_text(members) for key, members in rows.items()}
 
 
 def _csv_rows(table: Table) -> list[dict[str, object]]:
     """Return a table's rows as column -> value: rates in per cent, each followed by the bounds of its interval."""
-    names = [f"{title} {name}".lstrip() for title, name in zip(table.titles, table.header, strict=True)]
     rates = {c for row in table.rows for c, cell in enumerate(row) if isinstance(cell, Rate)}
     rows = []
     for row in table.rows:
-        found: dict[str, object] = {}
-        for column, (name, cell) in enumerate(zip(names, row, strict=True)):
+        values: dict[str, object] = {}
+        for column, (name, cell) in enumerate(zip(table.names, row, strict=True)):
             if isinstance(cell, PrefixRates):
-                found |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
+                values |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
             elif column in rates:
                 rate = cell if isinstance(cell, Rate) else Rate(None, 0)
                 low, high = rate.interval or (None, None)
-                found |= {name: percent(rate.value), f"{name} low": percent(low), f"{name} high": percent(high)}
+                values |= {name: percent(rate.value), f"{name} low": percent(low), f"{name} high": percent(high)}
             elif cell != "":
-                found[name] = cell
-        rows.append(found)
+                values[name] = cell
+        rows.append(values)
     return rows
 
 
-def csv_text(rows: Sequence[Sequence[object]], header: Sequence[str]) -> str:
-    """Return rows as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field.
+def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Return rows, column -> value, as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field.
 
     A name that a spreadsheet would take for a formula gets an apostrophe in front: logs may be of strangers.
     """
+
+    def escaped(value: object) -> object:
+        formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
+        return f"'{value}" if formula else value
+
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerows([_csv_field(value) for value in row] for row in (header, *rows))
+    header = {name: escaped(name) for row in rows for name in row}
+    writer = csv.DictWriter(out, header, lineterminator="\n")
+    writer.writerows({name: escaped(value) for name, value in row.items()} for row in (header, *rows))
     return out.getvalue()
-
-
-def _csv_field(value: object) -> object:
-    if value is None:
-        return ""
-    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")) else value

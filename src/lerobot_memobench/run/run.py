@@ -11,7 +11,7 @@ from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, rea
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, asked_for, read_protocol
+from lerobot_memobench.evaluation.records import Run, read_protocol, requested_lines
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import count_of, refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
@@ -97,7 +97,7 @@ def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note
 
 def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> Run:
     """Write the report of the log, and the outcomes onto the card."""
-    records = asked_for(plan.log, read_log(plan.log))
+    records = requested_lines(plan.log, read_log(plan.log))
     write_card(plan.log, with_episodes(with_checkpoint(card, plan.policy_path), records))
     return write_report(plan.log)
 

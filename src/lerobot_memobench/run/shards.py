@@ -20,8 +20,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import EXTENT, POLICY, differences, has_log, key_of, read_log, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of, read_evaluation, write_protocol
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreement
-from lerobot_memobench.evaluation.asked import check_lines, extent_of
+from lerobot_memobench.evaluation.agreement import check_lines, disagreement, extent_of
 from lerobot_memobench.evaluation.records import Run, read_protocol
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, refuse_links
@@ -242,7 +241,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     (out / EVALUATION_FILE).unlink(missing_ok=True)
     if card is not None:
         extent = extent_of(card, joined)
-        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.asks(each)]))
+        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.includes(each)]))
     elif all(stored):  # the first protocol that has a setting counts
         settings = functools.reduce(lambda first, other: {**other, **first}, [*stored, *protocols.values()])
         write_protocol(out, {key: value for key, value in settings.items() if key not in EXTENT})

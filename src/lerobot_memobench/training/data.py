@@ -24,12 +24,15 @@ from lerobot_memobench.datasets.frames import (
     Encoded,
     FrameLookup,
     Remember,
+    SamplesInMemory,
     TextEncoder,
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.lerobot_format.layout import EPISODE_INFO, check_clock, read_info, without_pattern
+from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
+from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
+from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -84,7 +87,8 @@ class Training:
         chunk = self.policy.config.action_delta_indices
         if not self.lookup.columns:
             return DecodedSamples(dataset, self.lookup, chunk, self.seed)
-        return RecordedSamples(self.lookup, dataset.meta.tasks.index.tolist(), chunk)
+        tasks = dataset.meta.tasks.index.tolist()
+        return SamplesInMemory(self.lookup.columns, self.lookup.runs, {ACTION: chunk}, tasks)  # chunks end at a hold
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
@@ -235,28 +239,6 @@ def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
 
 
 # -- samples -----------------------------------------------------------------------------------------------------------
-
-
-class RecordedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, from columns in main memory, without pictures.
-
-    Chunks end at a hold as at the end of an episode.
-
-    Args:
-        chunk: steps of a sample's actions, relative to its frame.
-    """
-
-    def __init__(self, lookup: FrameLookup, tasks: Sequence[str], chunk: Sequence[int]) -> None:
-        self._lookup, self._tasks, self._chunk = lookup, tasks, torch.tensor([*chunk])
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        lookup = self._lookup
-        first, end = lookup.run_of(index)
-        found: dict[str, Any] = {name: column[index] for name, column in lookup.columns.items()}
-        wanted = index + self._chunk
-        found[ACTION] = lookup.columns[ACTION][wanted.clamp(first, end - 1)]
-        found[f"{ACTION}_is_pad"] = (wanted < first) | (wanted >= end)
-        return found | {"task": self._tasks[int(found["task_index"])]}
 
 
 class DecodedSamples(Dataset[dict[str, Any]]):

@@ -33,18 +33,16 @@ from PIL import Image, ImageOps
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
+from lerobot_memobench.datasets.lerobot_format.columns import LANGUAGE, PRIVILEGED, image_key
+from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.lerobot_format.layout import (
+    EPISODES,
     INFO_FILE,
-    LANGUAGE,
-    PRIVILEGED,
     STATS_FILE,
     TASKS_FILE,
-    image_key,
-    read_info,
-    undamaged,
     without_pattern,
 )
-from lerobot_memobench.datasets.lerobot_format.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, tables_of, undamaged
 from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.datasets.video import mirror_video, video_info
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
@@ -59,7 +57,6 @@ from lerobot_memobench.training.configuration import check_environment, with_fea
 from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
-EPISODES_FOLDER = Path("meta") / "episodes"
 SOURCE_EPISODE = "source_episode_index"
 """Column of a view's episodes: the dataset's episode of which each is a part."""
 
@@ -274,14 +271,12 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     build = out.with_name(f".{out.name}.{os.getpid()}")
     with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
-        for path in files_below(root / "data", ".parquet"):
+        for path, rows in tables_of(root / "data"):
             with undamaged(path):
-                frames = _frames_of(pq.read_table(path), kept, part, info["fps"])
+                frames = _frames_of(rows, kept, part, info["fps"])
                 frames = _mirrored(frames) if mirrors else frames
             _write_table(frames, build / path.relative_to(root))
-        for path in files_below(root / EPISODES_FOLDER, ".parquet"):
-            with undamaged(path):
-                rows = pq.read_table(path)
+        for path, rows in tables_of(root / EPISODES):
             _write_table(_episodes_of(rows, kept, part, info["fps"]), build / path.relative_to(root))
         features = {new: info["features"][name] for name, new in kept.items()}
         for name in cameras_of(info["features"]):

@@ -18,25 +18,27 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
 from lerobot_memobench.datasets.lerobot_format.card import write_card
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    DEFAULT_REPO_ID,
+from lerobot_memobench.datasets.lerobot_format.columns import (
     EPISODE_INFO,
     EXECUTED_ACTION,
     LANGUAGE,
-    MANIFEST_FILE,
-    STAGING,
-    TOP_LEVEL,
-    Written,
-    check_destination,
     dataset_features,
-    dataset_files,
     image_key,
     objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.reading import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.layout import (
+    DEFAULT_REPO_ID,
+    MANIFEST_FILE,
+    STAGING,
+    TOP_LEVEL,
+    dataset_files,
+)
+from lerobot_memobench.datasets.lerobot_format.manifest import Written
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
 from lerobot_memobench.datasets.staging import (
     TEMPORARY,
     StagedEpisode,
+    check_destination,
     flush_to_disk,
     stage_demonstration,
 )

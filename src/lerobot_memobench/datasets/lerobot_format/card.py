@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from huggingface_hub import DatasetCardData
+from huggingface_hub import DatasetCard, DatasetCardData
 
-from lerobot_memobench.datasets.lerobot_format.layout import read_info, undamaged
+from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, EpisodePlace, list_episodes
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.lerobot_format.tables import read_info, undamaged
 from lerobot_memobench.datasets.staging import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import files_below
@@ -31,69 +33,6 @@ SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; no data of people or robots was collected. Actions were recorded as "
     "applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
-OWN_TERMS = "Apache-2.0: the demonstrations, and `lerobot_memobench`, which made them."
-LIBERO_TERMS = (
-    "The scenes consist of LIBERO's assets (Liu et al., 2023). LIBERO's code is under MIT and its datasets are under "
-    "CC BY 4.0; the packages of its assets state MIT. Name LIBERO where you show the images. The additions of "
-    "`lerobot_memobench`, such as actions, labels and tables, are under Apache-2.0."
-)
-AUTHORS_TERMS = (
-    "{subject} of MEMOBench's authors are under CC BY-NC 4.0 by the licence of their repository, "
-    "Collab-Gen/MEMOBench; their paper announces CC BY 4.0 for the data. Unless they say otherwise, use this dataset "
-    "for research that is not commercial, and name them (Sun et al.)."
-)
-LIMITATIONS = """\
-- One simulated kitchen, one Panda arm and one scripted expert: each task is done in one way and has one instruction.
-  Transfer to real images is untested.
-- In tasks with a demonstration prompt the texts of subgoals, memory and language rows name information that only the
-  prompt shows: the carton, the bowl, the drawer or the order. A policy that reads them during execution is not tested
-  for memory.
-- Visible objects, states, seeds and checkpoint columns come from the simulator and are not visible to cameras.
-- Frames of demonstration prompts show the information to remember, not the actions to take."""
-COLUMNS = {
-    "observation.images.image": "third-person camera",
-    **{f"observation.images.{name}": "wrist camera" for name in ("wrist_image", "image2")},
-    "observation.state": "end-effector position 3, axis-angle 3, gripper joints 2",
-    "action": "OSC pose delta 6 (±1 is ±0.05 m, ±0.5 rad), gripper (−1 opens, +1 closes)",
-    "observation.environment_state": "objects visible to the cameras, 16 slots: see `memobench objects`",
-    "privileged.environment_state": "the same in datasets with images: true poses, which LeRobot's own training does "
-    "not use as an input; `memobench_mem` with `perception=objects` reads them, others with `lerobot train "
-    "obs_type=both`",
-    "executed_action": "the applied action; differs from `action` where the arm was perturbed (`generate --perturb`)",
-    "observation.phase": "0 demonstration prompt and the rest after it (the policy does not act), 1 execution",
-    "observation.step": "control steps since that phase began; -1 in the execution of strict tasks",
-    "held": "the scene of a strict task is held at home in the execution: the action, zeros, has no effect",
-    "checkpoint.index": "number of checkpoints completed in order before this frame",
-    "checkpoint.operation": "of the next one: 0 Storage, 1 Update, 2 Compression; −1 when none is left",
-    "checkpoint.completed": "checkpoint k has been satisfied by now; false beyond the task's count",
-    "checkpoint.event": "a checkpoint is satisfied for the first time at this frame",
-    "subgoal.coarse": "the state that the present checkpoint reaches; after the last checkpoint its text remains",
-    "subgoal.intermediate": "the event of the present checkpoint, in the past tense",
-    "subgoal.fine": "the same in more detail, in the past tense",
-    "subgoal.instruction": "the intermediate text as an instruction, in the present tense",
-    "oracle_memory": "the intermediate texts of the checkpoints completed in order so far; empty at the start",
-    "language_persistent": "LeRobot's language rows for its training recipes: style `subtask`, the next step as an "
-    "instruction; style `memory`, the completed steps",
-    "episode_info": "JSON at an episode's first frame, else empty: the fields of the table below, and versions, "
-    "because LeRobot's dataset tools keep only columns of frames",
-}
-EPISODE_COLUMNS = {
-    "task_name": "task of the catalogue",
-    "memory_type": "temporal, spatial, object or procedural",
-    "family": "group of similar tasks",
-    "operations": "labels of the checkpoints in order, e.g. SUC",
-    "seed": "seed of the scene",
-    "referent": "fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it (strict tasks)",
-    "variant": "number of the referent or order; 0 is the published one",
-    "success": "the goal was reached",
-    "exec_start_index": "first frame of the execution",
-    "key_frames": "frame at which each checkpoint was completed in order, −1 if never",
-    "scene_hash": "hash of the initial scene",
-    "fixture_poses": "JSON, fixture to position and quaternion wxyz",
-    "digest": "sha256 of states, actions and labels",
-}
-
-
 _STATISTICS = ("tasks", "episodes", "steps", "mean", "median", "p95", "max", "gib")
 FAMILIES: dict[str, dict[str, Any]] = {
     "temporal": dict(zip(_STATISTICS, (10, 500, 198_099, 396.2, 400.5, 679.05, 779, 72.66), strict=True)),
@@ -130,7 +69,7 @@ def write_card(
     if left_out:
         made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {problem}" for problem in left_out))
     infos = [episode.info for episode in solved]
-    text = _card(infos, failed, features, _size(folder), made, _loading(repo_id, "<this folder>"))
+    text = _card(infos, failed, features, _size(folder), made, f'"{repo_id}", root="<this folder>"')
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -152,8 +91,8 @@ def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: s
         repo_id: its address on the hub; None if it is loaded from a folder.
     """
     infos = [{**row, "frames": row["length"]} for row in rows]
-    loading = _loading(repo_id or "local/demonstrations", None if repo_id else "<this folder>")
-    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], loading)
+    location = f'"{repo_id}"' if repo_id else '"local/demonstrations", root="<this folder>"'
+    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], location)
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
@@ -188,7 +127,7 @@ def _card(
     features: Mapping[str, dict[str, Any]],
     size: int,
     made: Sequence[str],
-    loading: str,
+    location: str,
 ) -> str:
     """Return the card.
 
@@ -198,9 +137,9 @@ def _card(
         features: columns of the dataset.
         size: bytes of the dataset.
         made: paragraphs on its making.
-        loading: code that loads it.
+        location: arguments of ``LeRobotDataset`` that load it.
     """
-    licence, section = terms(infos)
+    licence, is_libero, of_authors = terms(infos)
     data = DatasetCardData(
         license=licence,
         task_categories=["robotics"],
@@ -209,87 +148,30 @@ def _card(
         size_categories=["n<1K" if len(infos) < 1000 else "1K<n<10K"],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
-    parts = [
-        f"---\n{data.to_yaml()}\n---",
-        "# MEMOBench demonstrations",
-        *_introduction(infos, loading),
-        MADE_BY,
-        *made,
-        *_statistics(infos, failed, size),
-        "## Columns",
-        *_columns(features),
-        "## Limitations",
-        LIMITATIONS,
-        "## Licence",
-        section,
-    ]
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _loading(repo_id: str, root: str | None) -> str:
-    """Return code that loads the dataset from a folder, or from the hub."""
-    where = f'"{repo_id}"' if root is None else f'"{repo_id}", root="{root}"'
-    return f"""\
-```python
-from torch.utils.data import Subset
-from lerobot.datasets import LeRobotDataset
-
-dataset = LeRobotDataset({where})
-frames = zip(dataset.hf_dataset["observation.phase"], dataset.hf_dataset["held"])
-execution = Subset(dataset, [i for i, (phase, held) in enumerate(frames) if phase == 1 and not held])
-```"""
-
-
-def _introduction(infos: Sequence[Mapping[str, Any]], loading: str) -> list[str]:
-    tasks = {info["task_name"] for info in infos}
-    return [
-        f"{len(infos)} demonstrations of {len(tasks)} robot manipulation tasks that need memory "
-        f"({', '.join(ordered_types(infos))}), as a LeRobotDataset v3.0 at 20 frames per second. Each task has "
-        "checkpoints that a memory must store (Storage), revise (Update) or summarise (Compression); the simulator "
-        "labels each frame with the completed ones. Benchmark and metrics: MEMOBench; generator, environment and "
-        "policies: `lerobot_memobench`.",
-        *_world(infos),
-        loading,
-        "`execution` leaves out the frames of demonstration prompts and held frames, in which the policy does not act, "
-        "as `lerobot train` of `lerobot_memobench` does; an action chunk ends where the next held frame begins. To "
-        "load one memory type, use `episode_filter=lambda episode: "
-        'episode["memory_type"] == "spatial"`. Pass `collate_fn=lerobot.utils.collate.lerobot_collate_fn` to your own '
-        "DataLoader, as `lerobot-train` does: the number of language rows differs between episodes.",
-    ]
-
-
-SCENES = "The scenes are made of LIBERO's assets."
-
-
-def _world(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a paragraph on the source of the scenes."""
-    missing = sorted({name for info in infos for name in info.get("stand_ins") or ()})
-    stand_ins = f" This package's objects replace missing scans: {', '.join(missing)}." if missing else ""
-    former = any(info.get(WORLD) != LIBERO for info in infos)
-    return ["The scenes are those that version 0.2 modelled in code." if former else f"{SCENES}{stand_ins}"]
-
-
-def _columns(features: Mapping[str, dict[str, Any]]) -> list[str]:
-    convention = convention_of(features)
-    return [
-        *(
-            [f"Images have `convention={convention}`; with `libero` they are mirrored left to right."]
-            if convention
-            else []
-        ),
-        markdown(
-            ["column", "type", "meaning"],
-            [[f"`{key}`", _type(ft), COLUMNS[key]] for key, ft in features.items() if key in COLUMNS],
-        ),
-        "Further columns are LeRobot's own: `task`, `timestamp`, `frame_index`, `episode_index`, `index`, "
-        "`task_index`.",
-        "Per episode, in `meta/episodes` (after LeRobot's dataset tools: `episodes=episodes_where(folder, "
-        'memory_type="spatial")` with `from lerobot_memobench.datasets.lerobot_format.reading import episodes_where`):',
-        markdown(["column", "meaning"], [[f"`{key}`", meaning] for key, meaning in EPISODE_COLUMNS.items()]),
-        "`meta/stats.json` holds mean, standard deviation, range and the quantiles q01, q10, q50, q90, q99; those of "
-        "numbers are exact over all frames that are not held, those of images over sampled frames. `observation.phase` "
-        "and `observation.step` have none, so that LeRobot does not normalise them and they are as in a rollout.",
-    ]
+    total = _figures(infos)
+    shown = [[f"`{key}`", _type(ft), MEANINGS[key]] for key, ft in features.items() if key in MEANINGS]
+    described = EpisodeRecord.meanings().items()
+    card = DatasetCard.from_template(
+        data,
+        str(Path(__file__).with_name("card.md.jinja")),
+        total=total,
+        types=ordered_types(infos),
+        former=any(info.get(WORLD) != LIBERO for info in infos),
+        stand_ins=sorted({name for info in infos for name in info.get("stand_ins") or ()}),
+        location=location,
+        made=[paragraph for paragraph in made if paragraph],
+        lengths=_lengths_table(infos),
+        bytes_per_frame=f"{size / total['steps']:,.0f}",
+        prompts=_prompts(infos),
+        buckets=_buckets_table(infos),
+        tasks=_tasks_table(infos, failed),
+        convention=convention_of(features),
+        columns=markdown(["column", "type", "meaning"], shown),
+        episode_columns=markdown(["column", "meaning"], [[f"`{key}`", text] for key, text in described]),
+        is_libero=is_libero,
+        of_authors=of_authors,
+    )
+    return str(card).rstrip() + "\n"
 
 
 def _type(feature: dict[str, Any]) -> str:
@@ -307,13 +189,14 @@ def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
 # --- the licence ---
 
 
-def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
-    """Return a dataset's licence, as the hub names it, and the licence section of its card.
-
-    They depend on the source of the scenes and on that of the demonstrations.
+def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, bool, list[str]]:
+    """Return a dataset's licence, as the hub names it, and its reasons.
 
     Args:
         infos: information on its episodes (`staging.episode_info`).
+
+    Returns:
+        The licence, whether scenes are LIBERO's, and the parts that are of MEMOBench's authors.
     """
     infos = list(infos)
     there = [info for info in infos if info.get(WORLD) == LIBERO]
@@ -321,10 +204,8 @@ def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, str]:
         "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
         "The scanned objects": any(map(_shows_scans, there)),
     }
-    parts = [AUTHORS_TERMS.format(subject=subject) for subject, shown in theirs.items() if shown]
-    if not there and not parts:
-        return "apache-2.0", OWN_TERMS
-    return "cc-by-nc-4.0" if parts else "other", "\n\n".join([*([LIBERO_TERMS] if there else []), *parts])
+    parts = [part for part, shown in theirs.items() if shown]
+    return "cc-by-nc-4.0" if parts else "other" if there else "apache-2.0", bool(there), parts
 
 
 def _shows_scans(info: Mapping[str, Any]) -> bool:
@@ -338,27 +219,14 @@ def _shows_scans(info: Mapping[str, Any]) -> bool:
 # --- statistics, and the paper's ---
 
 
-def _statistics(written: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode], size: int) -> list[str]:
-    return [
-        "## Statistics",
-        "Steps are frames: control steps of 50 ms, demonstration prompt included. The paper's rows are those of its "
-        "demonstrations (appendix, family level statistics).",
-        _lengths_table(written),
-        f"{size / sum(info['frames'] for info in written):,.0f} bytes per frame.",
-        _prompts(written),
-        "Number of episodes by length, in steps (paper: appendix, distribution of lengths):",
-        _buckets_table(written),
-        _tasks_table(written, failed),
-    ]
-
-
-def _prompts(infos: Sequence[dict[str, Any]]) -> str:
+def _prompts(infos: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the mean length of prompts for each memory type that has some."""
     parts = []
     for name in ordered_types(infos):
         lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
         if any(lengths):
             parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
-    return f"The demonstration prompt takes, on average, {' and '.join(parts)} of these steps." if parts else ""
+    return parts
 
 
 def _size(folder: Path) -> int:

@@ -1,38 +1,38 @@
-"""Read a dataset of this package: the record of each episode, and an episode's frames.
+"""Read episodes of a dataset: the record of each, and an episode's frames.
 
 LeRobot's dataset tools may have edited it; the records are then read from the frames (`EpisodeRecord`).
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.lerobot_format.columns import (
     EPISODE_INFO,
-    EXECUTED_ACTION,
     LANGUAGE,
-    OBJECTS,
-    PRIVILEGED,
-    is_dataset,
+)
+from lerobot_memobench.datasets.lerobot_format.layout import EPISODES, is_dataset
+from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord, from_frames, from_meta
+from lerobot_memobench.datasets.lerobot_format.tables import (
+    is_numeric,
+    numbers,
     read_info,
-    undamaged,
+    read_table,
+    read_tasks,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Malformed, Number, Whole, files_below, first_fault, parsed
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
-    import pyarrow as pa
+    pass
 
 Columns = dict[str, Any]
 STRANGER = (
@@ -40,106 +40,6 @@ STRANGER = (
     f"without the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
 )
 """Message for an episode without a record."""
-WHOLE = {
-    "memory_type",
-    "family",
-    "operations",
-    "success",
-    "key_frames",
-    "scene_hash",
-    "fixture_poses",
-    "digest",
-}
-"""Fields of a record that are determined by task, seed and actions."""
-
-
-# --- the record of an episode ---
-
-
-class EpisodeRecord(BaseModel):
-    """Fields of an episode as a whole: its task, seed, placement, hashes.
-
-    A dataset stores it twice: in ``meta/episodes``, which ``LeRobotDataset(…, episode_filter=…)`` reads, and as JSON in
-    the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
-    keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files.
-
-    Attributes:
-        seed: seed of the scene; -1 if unknown.
-        key_frames: one per checkpoint, -1 if it was not completed.
-        fixture_poses: fixture to position and quaternion wxyz.
-        digest: sha256 of states, actions and labels; None in datasets of earlier versions.
-        world: ``libero``; None for the scenes that version 0.2 modelled in code, as for stand_ins.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        versions: versions of the packages on which the numbers depend; None if unknown.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    task_name: str
-    memory_type: str
-    family: str = ""
-    operations: str = ""
-    seed: Whole
-    referent: str = "fixed"
-    variant: Count
-    success: bool | None = None
-    exec_start_index: Count
-    key_frames: list[Whole]
-    scene_hash: str | None = None
-    fixture_poses: dict[str, list[Number]] | None = None
-    digest: str | None = None
-    world: str | None = None
-    stand_ins: list[str] | None = None
-    versions: dict[str, str] | None = None
-
-    def in_frames(self) -> str:
-        """Return the text of the first frame's column."""
-        return self.model_dump_json(exclude_none=True)
-
-    def in_meta(self) -> dict[str, Any]:
-        """Return the columns of ``meta/episodes``."""
-        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
-        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
-            "key_frames": np.array(self.key_frames, dtype=np.int64),
-            "fixture_poses": json.dumps(self.fixture_poses),
-            **elsewhere,
-        }
-
-
-def from_frames(text: str, where: str) -> EpisodeRecord:
-    """Return the record in the text of an episode's first frame.
-
-    Args:
-        text: JSON.
-        where: dataset and episode, for the message.
-
-    Raises:
-        MemobenchError: the text is no record.
-    """
-    try:
-        value = parsed(text)
-        try:
-            return EpisodeRecord.model_validate(value)
-        except ValidationError as error:
-            raise Malformed(first_fault(error.errors(include_url=False), value)) from None
-    except Malformed as error:
-        raise MemobenchError(
-            f"{where}: its column {EPISODE_INFO} is not as this package writes it ({error}); take the dataset from its "
-            "source again"
-        ) from None
-
-
-def from_meta(row: Mapping[str, Any]) -> EpisodeRecord | None:
-    """Return the record in a row of ``meta/episodes``; None if it is missing or incomplete."""
-    values = {key: row[key] for key in EpisodeRecord.model_fields if row.get(key) is not None}
-    try:
-        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
-        return EpisodeRecord.model_validate(values | in_json)
-    except (ValidationError, ValueError, TypeError):
-        return None
-
-
-# --- episodes ---
 
 
 @dataclass(frozen=True)
@@ -169,7 +69,8 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
     """
     read_info(folder)
     rows = _rows(folder)
-    first = _read(folder / "data", ("episode_index", EPISODE_INFO), [("frame_index", "==", 0)]).to_pylist()
+    own = ("episode_index", EPISODE_INFO)
+    first = read_table(folder / "data", own.__contains__, [("frame_index", "==", 0)]).to_pylist()
     texts = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
     return [_place(folder, row, texts.get(row["episode_index"])) for row in rows]
 
@@ -241,19 +142,14 @@ class RecordedEpisode:
 
     Attributes:
         columns: values per frame; the column ``task`` is the instruction.
-        whole: fields of the episode as a whole.
+        whole: fields that a replay must reproduce (`EpisodeRecord.determined`), and the language rows.
         start: first frame in the dataset's global index.
     """
 
-    task_name: str
-    variant: int
-    seed: int
-    referent: str
-    exec_start: int
+    record: EpisodeRecord
     columns: Columns
     whole: dict[str, Any]
-    start: int = 0
-    world: str | None = None
+    start: int
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
@@ -274,8 +170,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    fields = record.model_dump(include=WHOLE)
-    whole = {key: value for key, value in fields.items() if value not in (None, "")}
+    whole = {key: value for key, value in record.determined().items() if value not in (None, "")}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
         changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
@@ -283,18 +178,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
             raise MemobenchError(
                 f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
             )
-    _name_tasks(root, columns)
-    return RecordedEpisode(
-        record.task_name,
-        record.variant,
-        record.seed,
-        record.referent,
-        record.exec_start_index,
-        columns,
-        whole,
-        place.start,
-        record.world,
-    )
+    return RecordedEpisode(record, columns, whole, place.start)
 
 
 def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | None], length: int) -> None:
@@ -313,21 +197,11 @@ def _check_record(row: dict[str, Any], record: EpisodeRecord, texts: list[str | 
         raise MemobenchError(f"meta/episodes has length={row['length']}, but it has {length} frames")
 
 
-def _name_tasks(root: Path, columns: Columns) -> None:
-    """Replace the number of each frame's instruction by the instruction, as ``task``."""
-    from lerobot.datasets.io_utils import load_tasks
-
-    with undamaged(root / "meta" / "tasks.parquet"):
-        tasks = load_tasks(root)
-    names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
-    columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
-
-
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
     """Return the rows of meta/episodes, or that of one episode, in order and without statistics."""
     own = ("episode_index", "length", "dataset_from_index", "tasks", *EpisodeRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
-    return _read(folder / "meta" / "episodes", own, chosen).sort_by("episode_index").to_pylist()
+    return read_table(folder / EPISODES, own.__contains__, chosen).sort_by("episode_index").to_pylist()
 
 
 def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
@@ -337,35 +211,18 @@ def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
     return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record, instructions)
 
 
-def _read(folder: Path, names: tuple[str, ...] | None, chosen: list[tuple[str, str, int]] | None) -> pa.Table:
-    """Return the existing ones among the columns (None: all) of all files; files of merged datasets may differ."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    tables = []
-    for path in files_below(folder, ".parquet"):
-        with undamaged(path):
-            there = pq.read_schema(path).names
-            columns = None if names is None else [name for name in names if name in there]
-            tables.append(pq.read_table(path, columns=columns, filters=chosen))
-    if not tables:
-        raise MemobenchError(f"{folder} holds no parquet file: the dataset is incomplete; fetch or generate it again")
-    return pa.concat_tables(tables, promote_options="permissive")
-
-
 def _read_columns(root: Path, episode_index: int) -> Columns:
-    """Return the columns of an episode's frames and, if stored, its states."""
+    """Return the columns of an episode's frames, its instructions as ``task``, and, if stored, its states."""
     chosen = [("episode_index", "==", episode_index)]
-    table = _read(root / "data", None, chosen).sort_by("frame_index")
+    table = read_table(root / "data", rows=chosen).sort_by("frame_index")
     columns: Columns = {}
-    for name in table.column_names:
-        values = table.column(name).to_pylist()
-        is_text = name == LANGUAGE or isinstance(values[0], str)
-        columns[EARLIER_COLUMNS.get(name, name)] = values if is_text else np.array(values)
-    for name in ("action", EXECUTED_ACTION, "observation.state", OBJECTS, PRIVILEGED):
-        if name in columns:
-            columns[name] = columns[name].astype(np.float32)
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        values = np.array(numbers(column)) if is_numeric(column.type) else column.to_pylist()
+        columns[EARLIER_COLUMNS.get(name, name)] = values
+    tasks = read_tasks(root)
+    names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
+    columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]
     if (root / "states").is_dir():
-        states = _read(root / "states", None, chosen).sort_by("frame_index")
-        columns["states"] = np.array(states.column("state").to_pylist(), dtype=np.float64)
+        states = read_table(root / "states", rows=chosen).sort_by("frame_index")
+        columns["states"] = numbers(states.column("state"))
     return columns

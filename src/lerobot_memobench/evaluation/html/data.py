@@ -41,10 +41,8 @@ from lerobot_memobench.tasks.task import LEVELS, Task
 
 def task_source(names: Iterable[str], task_dir: str | Path | None = None) -> dict[str, Task]:
     """Return the tasks whose texts are known: the named ones of the catalogue, and those of a folder of tasks."""
-    known = {name: get_task(name) for name in names if suite_of(name) is not None}
-    if task_dir is not None:
-        known |= {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
-    return known
+    own = {} if task_dir is None else {folder.name: load_task(folder) for folder in find_tasks(task_dir)}
+    return {name: get_task(name) for name in names if suite_of(name) is not None} | own
 
 
 def page_data(
@@ -87,35 +85,28 @@ def page_data(
 # --- tasks ---
 
 
-def tasks_data(records: Iterable[Record], known: Mapping[str, Task]) -> dict[str, Any]:
+def tasks_data(records: Sequence[Record], known: Mapping[str, Task]) -> dict[str, Any]:
     """Return per task of the rollouts, by memory type and name, its language, and the texts of each variant."""
-    sample = {record["task"]: record for record in records}
-    seen = {(record["task"], _variant(record)) for record in records}
+    last = {record["task"]: record for record in records}
     result: dict[str, Any] = {}
-    for name, (record, *_) in by_task(sample.values()).items():
+    for name, (record,) in by_task(last.values()).items():
         task = known.get(name)
+        variants = sorted({_variant(each) for each in records if each["task"] == name})
+        if task is None or task.operations != operations(record):
+            variants = []
         result[name] = {
             "memory_type": record["memory_type"],
             "id": libero_id(name),
             "language": task.title if task else name.replace("_", " "),
-            "variants": {
-                str(k): variant_data(task.variant(k))
-                for k in sorted(variant for its_name, variant in seen if its_name == name)
-                if task and k < task.num_variants and task.operations == operations(record)
-            },
+            "variants": {str(k): variant_data(task.variant(k)) for k in variants if task and k < task.num_variants},
         }
     return result
 
 
 def variant_data(task: Task) -> dict[str, Any]:
     """Return goal and checkpoints of one variant; texts are coarse, intermediate, fine."""
-    return {
-        "goal": format_formula(task.goal),
-        "checkpoints": [
-            {"goal": format_formula(checkpoint.goal), "texts": list(checkpoint.language)}
-            for checkpoint in task.checkpoints
-        ],
-    }
+    checkpoints = [{"goal": format_formula(each.goal), "texts": list(each.language)} for each in task.checkpoints]
+    return {"goal": format_formula(task.goal), "checkpoints": checkpoints}
 
 
 def _variant(record: Record) -> int:
@@ -149,11 +140,7 @@ def facts(run: Run) -> list[str]:
     """Return the line below the first one: rollouts, their horizon, and how often choices follow the evidence."""
     horizons = dict.fromkeys(each.protocol.get("horizon") for each in run.evaluations)
     evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
-    return [
-        count_of(len(run.records), "rollout"),
-        *(f"horizon {horizon}" for horizon in horizons if horizon),
-        *evidence,
-    ]
+    return [count_of(len(run.records), "rollout"), *(f"horizon {each}" for each in horizons if each), *evidence]
 
 
 def task_data(name: str, summary: Summary) -> dict[str, Any]:

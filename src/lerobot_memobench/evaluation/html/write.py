@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import itertools
 import json
 import os
 import re
 import shutil
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from html import escape
 from importlib import resources
@@ -33,19 +35,8 @@ from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 PAGE = "index.html"
 VIDEOS, VIDEO = "videos", ".mp4"
 SCRIPTS = (
-    "dom",
-    "address",
-    "filter",
-    "overview",
-    "list",
-    "lanes",
-    "reads",
-    "timeline",
-    "player",
-    "panel",
-    "detail",
-    "pair",
-    "main",
+    *("dom", "address", "filter", "overview", "list", "lanes", "reads", "timeline", "player", "panel", "detail"),
+    *("pair", "main"),
 )
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
 MARK = "memobench html"
@@ -55,7 +46,7 @@ UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" con
 
 
 @dataclass(frozen=True)
-class Written:
+class HtmlReport:
     """A written report: the page, its rollouts, how many of them have a video, and notes on the logs."""
 
     page: Path
@@ -64,7 +55,7 @@ class Written:
     notes: list[str]
 
 
-def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | Path | None = None) -> Written:
+def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | Path | None = None) -> HtmlReport:
     """Write the report of one or several evaluations into ``out``; an earlier report there is replaced.
 
     Args:
@@ -83,18 +74,18 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
     reads: list[dict[int, list[Chunk]]] = []
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
-        found, read, notes, first = dict[int, Path](), dict[int, list[Chunk]](), list[str](), 0
+        videos, chunks, notes, first = dict[int, Path](), dict[int, list[Chunk]](), list[str](), 0
         for each in run.evaluations:
-            videos, misfits = find_videos(each.folder, each.records)
+            own_videos, misfits = find_videos(each.folder, each.records)
             own_reads, others = find_reads(each.folder, each.records, each.protocol)
-            found |= {first + k: video for k, video in videos.items()}
-            read |= {first + k: chunks for k, chunks in own_reads.items()}
+            videos |= {first + k: video for k, video in own_videos.items()}
+            chunks |= {first + k: read for k, read in own_reads.items()}
             notes += [*misfits, *others]
             first += len(each.records)
-        names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}{VIDEO}" for k in found}
-        chosen |= {out / name: found[k] for k, name in names.items()}
+        names = {k: f"{VIDEOS}/{slug}/{episode_id(run.records[k])}{VIDEO}" for k in videos}
+        chosen |= {out / name: videos[k] for k, name in names.items()}
         addresses.append(names)
-        reads.append(read)
+        reads.append(chunks)
         runs.append(replace(run, notes=(*run.notes, *notes)))
     refuse_links(out / VIDEOS, *(target.parent for target in chosen))
     known = task_source({record["task"] for run in runs for record in run.records}, task_dir)
@@ -106,7 +97,7 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         place_videos(chosen)
         write_file(out / PAGE, text)
         linked = _remove_other_videos(out, chosen)
-    return Written(
+    return HtmlReport(
         page=out / PAGE,
         rollouts=sum(len(run.records) for run in runs),
         videos=len(chosen),
@@ -116,15 +107,13 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
 
 def _slugs(names: Sequence[str]) -> list[str]:
     """Return for each name that of a folder: plain characters, all distinct."""
-    slugs: list[str] = []
+    slugs: dict[str, str] = {}  # in lower case, since some file systems ignore case
     for name in names:
         base = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
-        slug, k = base, 1
-        while slug.lower() in (other.lower() for other in slugs):  # some file systems ignore case
-            k += 1
-            slug = f"{base}_{k}"
-        slugs.append(slug)
-    return slugs
+        candidates = (base if k == 1 else f"{base}_{k}" for k in itertools.count(1))
+        slug = next(each for each in candidates if each.lower() not in slugs)
+        slugs[slug.lower()] = slug
+    return [*slugs.values()]
 
 
 def _check_target(out: Path) -> None:
@@ -166,43 +155,34 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
 
     A video counts only when it is as long as its rollout: a timeline under another rollout's video would mislead.
     """
-    found: dict[int, Path] = {}
+    videos: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
-        if not _names_a_file(episode_id(record)):
-            continue
-        video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
-        if video.is_file():
-            if _fits(frame_count(video), record):
-                found[k] = video
-            else:
-                misfits.append(video.name)
+        with suppress(MemobenchError):  # a log is only text, which must not lead out of these folders
+            file_name(episode_id(record), "a rollout's name")
+            video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
+            if video.is_file():
+                if _fits(frame_count(video), record):
+                    videos[k] = video
+                else:
+                    misfits.append(video.name)
     # A video's name does not hold the referent: where both settings are in one log, it could be of either.
-    claims = Counter(found.values())
+    claims = Counter(videos.values())
     misfits += [video.name for video, count in claims.items() if count > 1]
-    found = {k: video for k, video in found.items() if claims[video] == 1}
+    videos = {k: video for k, video in videos.items() if claims[video] == 1}
     if not misfits:
-        return found, []
-    named = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
-    return found, [f"Videos that do not clearly belong to a logged rollout were left out: {named}."]
-
-
-def _names_a_file(name: str) -> bool:
-    """Whether a rollout's name may be a file's: a log is only text, which must not lead out of these folders."""
-    try:
-        return bool(file_name(name, "a rollout's name"))
-    except MemobenchError:
-        return False
+        return videos, []
+    listed = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
+    return videos, [f"Videos that do not clearly belong to a logged rollout were left out: {listed}."]
 
 
 def _fits(frames: int | None, record: Record) -> bool:
-    """Whether a video has a frame of the start, one per control step, and its last one held; logs without lengths take
-    any.
+    """Return whether a video has a frame of the start, one per control step, and its last one held.
+
+    Logs without lengths take any.
     """
-    if frames is None:
-        return False
-    if record.get("steps") is None:
-        return True
+    if frames is None or record.get("steps") is None:
+        return frames is not None
     return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + LAST_FRAMES + 1
 
 
@@ -255,7 +235,7 @@ def page(data: Mapping[str, Any], title: str) -> str:
         "data": inline_json(data),
     }
     # In one pass, so that inserted text is never taken for a placeholder.
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _read(PAGE))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _read(PAGE))
 
 
 def inline_json(value: Any) -> str:
@@ -273,7 +253,6 @@ def content_policy(style: str, script: str) -> str:
 
 
 def _script() -> str:
-    """The parts as one script, in a scope of its own."""
     data = 'const DATA = JSON.parse(document.getElementById("data").textContent);\n'
     parts = [_read(f"script/{name}.js") for name in SCRIPTS]
     return '"use strict";\n(() => {\n' + data + "\n".join(parts) + "})();\n"
