@@ -316,8 +316,6 @@ def schemas_page() -> str:
         ("Policy of a card", evaluation_file.Policy),
         ("Checkpoint of a card", evaluation_file.Checkpoint),
         ("One start", evaluation_file.Start),
-        ("Runs of the sealed test", evaluation_file.SealedRun),
-        ("A run before it", evaluation_file.SealedStart),
         ("Episodes of a card", evaluation_file.CardEpisode),
     ]
     parts = [

@@ -15,11 +15,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Optional
 
+import draccus
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import typer
+from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
@@ -339,6 +341,10 @@ def check(words: list[str]) -> None:
             check_vla_eval(rest)
         case "lerobot-dataset-viz":
             check_viewer(rest)
+        case "lerobot-edit-dataset":
+            draccus.parse(EditDatasetConfig, args=rest)
+        case "sbatch":
+            check_sbatch(rest)
         case "make":
             assert re.search(rf"^{rest[0]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case _ if program.startswith("scripts/"):
@@ -393,6 +399,14 @@ def check_viewer(line: list[str]) -> None:
     assert not {word for word in line if word.startswith("--")} - known
 
 
+def check_sbatch(line: list[str]) -> None:
+    """Check long options, and the command of an array's job 1."""
+    *options, wrapped = line
+    assert [option for option in options if not re.fullmatch(r"--[a-z-]+(=\S+)?", option)] == []
+    assert wrapped.startswith("--wrap=")
+    check(shlex.split(re.sub(r"\$\{?SLURM_ARRAY_TASK_ID\}?", "1", wrapped.removeprefix("--wrap="))))
+
+
 def check_memobench(line: list[str]) -> None:
     """Parse a line as `memobench` does."""
     command: Any = typer.main.get_command(memobench.app)
@@ -430,13 +444,15 @@ def check_python(line: list[str]) -> None:
         "memobench generate --task object",
         "lerobot-dataset-viz --episode 0",
         "memobench no_such",
+        "sbatch --array=1-4 --wrap='memobench merges outputs/$SLURM_ARRAY_TASK_ID'",
+        "lerobot-edit-dataset --operation.type=mirge",
         "python examples/no_such.py",
         "make coffee",
         "roscore",
     ],
 )
 def test_invalid_commands_are_detected(line: str) -> None:
-    with pytest.raises((MemobenchError, AssertionError, KeyError, USAGE_ERROR)):
+    with pytest.raises((MemobenchError, AssertionError, KeyError, USAGE_ERROR, SystemExit)):
         check(shlex.split(line))
 
 

@@ -18,7 +18,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of, write_file
 from lerobot_memobench.jobs.processes import Advance, Job
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.jobs.slurm import Needs, Slurm, read_options
 from research.command import run
 from research.kept import keep as keep_evaluations
 from research.kept import restore
@@ -26,9 +25,6 @@ from research.memory_study.cells import Cell, Demonstrations
 from research.memory_study.figure import draw
 from research.memory_study.grid import GRID_FILE, Grid, chosen, read_grid
 from research.memory_study.tables import tables
-
-NEEDS = Needs(cores=2, memory_gb=8)
-"""Slurm resources of a cell of a small policy."""
 
 
 def study(
@@ -46,7 +42,6 @@ def study(
     controls: Annotated[bool, typer.Option(help="Run the controls, after all cells.")] = True,
     sealed: Annotated[bool, typer.Option("--sealed", help="Run the sealed test too: once, last.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
-    slurm: Annotated[str | None, typer.Option(help="Run on Slurm, with these options of sbatch.")] = None,
 ) -> None:
     """Train and evaluate every missing cell, then print and write the tables and the figure."""
     read = read_grid(grid)
@@ -74,7 +69,6 @@ def study(
     if plan:
         say(planned(data, cells, workers))
         return
-    cluster = None if slurm is None else Slurm(read_options(slurm), NEEDS, out / "logs", jobs_per_member=1)
     uncontrolled = [replace(cell, controlled=False, sealed=False) for cell in cells]  # all rows before any control
     stages = (("demonstrations", data, 1), ("cells", uncontrolled, workers), ("controls", cells, workers))
     for title, jobs, at_once in stages if controls or sealed else stages[:2]:
@@ -83,10 +77,7 @@ def study(
             def advance(news: Advance, count=count) -> None:  # type: ignore[no-untyped-def]
                 count(news.done, news.total, f"{news.task_name}, seed {news.seed}", found=news.found)
 
-            done = run_jobs(jobs, workers=at_once, progress=advance, slurm=cluster)
-        if not done:
-            say(f"{title} are submitted; give the command again when they have ended")
-            return
+            run_jobs(jobs, workers=at_once, progress=advance)
     write_results(read, out, out, figures)
 
 

@@ -137,10 +137,8 @@ def test_generate_reports_every_seed(
     monkeypatch.setattr(generation, "generate", generate)
     out = tmp_path / "demos"
     words = ["generate", "--tasks", TASK, "--episodes", "2", "--out", str(out), "--no-images", "--referent", "random"]
-    words += ["--slurm", "--partition=cpu --time=8:00:00"]
     assert main(words) == (0 if solved == 2 else 1)
     given = {"tasks": [TASK], "episodes": 2, "out": out, "referent": "random", "images": False, "seed_base": 10_000}
-    given["slurm"] = generation.slurm_of(out, ("--partition=cpu", "--time=8:00:00"))
     assert {key: asked[key] for key in given} == given
     printed = capsys.readouterr().out
     assert ("no dataset was written" in printed) == (solved == 0)

@@ -110,7 +110,6 @@ def test_a_second_writer_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, dataset: Path, command: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("out/notes.json", "out/.1-a.part.evaluation.json", "run/model", "files/a.hdf5"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")
@@ -174,7 +173,7 @@ class Job:
             time.sleep(0.1)
 
     def end(self, processes: int = 2) -> str:
-        """End it as Slurm does; return its message. No process may be left a moment later."""
+        """End it by SIGTERM, as a cluster does; return its message. No process may be left a moment later."""
         assert len(self.alive) >= processes  # else the check below would be empty
         self.process.terminate()
         try:

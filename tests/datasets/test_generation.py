@@ -14,18 +14,16 @@ from types import SimpleNamespace
 import pytest
 
 from lerobot_memobench.datasets import recording
-from lerobot_memobench.datasets.generation import generate, slurm_of
+from lerobot_memobench.datasets.generation import generate
 from lerobot_memobench.datasets.images import frame_reader
 from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
 from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.validate import episode_count
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.slurm import run_part
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.kills import hashes as tree_hash
 from tests.support.kills import killed_at
-from tests.support.sbatch import Sbatch
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*use of fork:DeprecationWarning")
 
@@ -216,22 +214,6 @@ def test_full_disk_keeps_finished_episodes(tasks, recorded, tmp_path, monkeypatc
     run(tasks, tmp_path / "ds")
     assert len(recorded) - made == 4 - len(staged)
     assert tree_hash(tmp_path / "ds") == reference
-
-
-def test_slurm_makes_an_equal_dataset(tasks, recorded, tmp_path, monkeypatch):
-    """With a replacement of sbatch: the command only submits, and the jobs make the dataset."""
-    sbatch, out = Sbatch(tmp_path / "bin", monkeypatch), tmp_path / "ds"
-    slurm = slurm_of(out, ("--partition=cpu",))
-    summary = run(tasks, out, slurm=slurm, workers=3)
-    assert (summary.submitted, summary.folder, recorded) == (True, None, [])
-    make, _ = sbatch.calls
-    assert {"--array=0-2%3", "--mem=4G", "--partition=cpu"} <= set(make)
-    for member in range(3):
-        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(member))
-        run_part("make", slurm.logs)
-    run_part("finish", slurm.logs)
-    assert len(recorded) == 4
-    assert tree_hash(out) == tree_hash_of_run(tasks, tmp_path / "here")
 
 
 @pytest.mark.parametrize(

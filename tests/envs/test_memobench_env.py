@@ -26,7 +26,7 @@ from lerobot_memobench.envs import memobench_env
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of
+from lerobot_memobench.envs.evaluation_file import protocol_of
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.observations import CHECKPOINTS, SPARSE
 from lerobot_memobench.envs.pacing import longest
@@ -544,19 +544,16 @@ def test_episodes_without_a_seed_are_outside_all_splits(tmp_path: Path) -> None:
     assert runs[0] == runs[1], "a seed determines the episodes after it"
 
 
-@pytest.mark.parametrize("counted", [False, True])
-def test_sealed_scene_is_logged_once_unless_its_run_is_counted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, counted: bool
+@pytest.mark.parametrize("salt", [None, "0" * 32])
+def test_sealed_scene_is_logged_once_outside_of_the_sealed_test(
+    caplog: pytest.LogCaptureFixture, salt: str | None
 ) -> None:
-    if counted:
-        run = {"release": "1", "run": 1, "earlier": []}
-        (tmp_path / EVALUATION_FILE).write_text(json.dumps({"protocol": {}, "sealed": run}))
-    memobench_env._log_sealed.cache_clear()
-    env = make(log_dir=str(tmp_path))
+    memobench_env._warn_of_sealed_seeds.cache_clear()
+    env = make(salt=salt)
     for seed, lines in ((7, 0), (100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
         env.reset(seed=seed)
-        found = [record for record in caplog.records if "sealed scenes" in record.getMessage()]
-        assert len(found) == (0 if counted else lines), seed
+        found = [record for record in caplog.records if "are sealed" in record.getMessage()]
+        assert len(found) == (lines if salt is None else 0), seed
 
 
 # --- gymnasium ---

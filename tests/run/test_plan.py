@@ -155,9 +155,7 @@ BAD: list[tuple[list[str], str]] = [
     (["shards=0"], "shards=0"),
     (["shards=many"], "shards=many"),
     (["resume=yes"], "true or false"),
-    (["slurm=--partition=gpu"], "shards=8"),
     (["workers=3"], "shards=8"),
-    (["shards=2", "slurm=gpu"], "--partition=gpu"),
     (["shard=1/2", "shards=2"], "shards=2"),
 ]
 
@@ -298,8 +296,8 @@ def test_run_options_are_taken_out_of_the_arguments() -> None:
     taken, rest = take_run_options(parse_words(["env=memobench", "resume=true", "episodes=3", "shard=2/3"]))
     assert rest == {"env": "memobench", "episodes": "3"}
     assert taken == RunOptions(resume=True, shard=Shard(2, 3))
-    taken, _ = take_run_options(parse_words(["shards=8", "workers=2", "slurm=--partition=gpu --mem=4G"]))
-    assert taken == RunOptions(shards=8, workers=2, slurm=("--partition=gpu", "--mem=4G"))
+    taken, _ = take_run_options(parse_words(["shards=8", "workers=2"]))
+    assert taken == RunOptions(shards=8, workers=2)
 
 
 def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:

@@ -1,4 +1,4 @@
-"""Parts of an evaluation: jobs here and on Slurm, and merging them or naming the reason why not."""
+"""Parts of an evaluation: jobs, and merging them or naming the reason why not."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protoc
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_protocol
-from lerobot_memobench.jobs.slurm import run_part
 from lerobot_memobench.run import shards
 from lerobot_memobench.run.card import new_card, policy_facts, run_facts, write_card
 from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.shards import merge, merge_and_report, part_folders, plan_shards, slurm_of
+from lerobot_memobench.run.shards import merge, merge_and_report, part_folders, plan_shards
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop
 from tests.support.logs import MISSING, SETTINGS
-from tests.support.sbatch import Sbatch
 
 COMMAND = ["eval", "env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "batch_size=2"]
 LINE = [*COMMAND[1:], "policy=memobench_random", "output_dir=out"]
@@ -167,30 +165,23 @@ def test_folders_of_parts_are_found_or_named(fake_loop: FakeLoop, capsys: pytest
 # --- jobs ---
 
 
-def test_slurm_gets_a_job_per_part_and_a_job_that_merges(
-    fake_loop: FakeLoop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_parts_here_are_run_and_merged(fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards.ShardJob, "run", lambda job: lerobot(job.arguments))
-    sbatch = Sbatch(tmp_path / "bin", monkeypatch)
-    words = ["slurm=--partition=gpu --time=08:00:00 --account=lab --no-requeue", "workers=2"]
-    assert lerobot([*COMMAND, "output_dir=out", "shards=4", *words]) == 0
-    assert "--cpus-per-task=2 --mem=8G --partition=gpu" in capsys.readouterr().out
-    assert fake_loop.ran == []
-    make, finish = sbatch.calls
-    assert {"--array=0-3%2", "--account=lab", "--no-requeue"} <= set(make)
-    assert "--dependency=afterany:4711" in finish  # a failed part does not leave it waiting
+    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=1"]) == 0
+    assert len(read_episodes(Path("out"))) == 8
 
-    def run(job: str, rank: int = 0) -> None:
-        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(rank))
-        run_part(job, tmp_path / "out" / "logs")
 
-    for rank in (0, 1, 3):
-        run("make", rank)
-    with pytest.raises(MemobenchError, match="shard-3-of-4"):
-        run("finish")
-    assert not Path("out/report.md").exists()
-    run("make", 2)
-    run("finish")
+def test_parts_of_an_array_are_merged_when_all_have_ended(fake_loop: FakeLoop) -> None:
+    """The commands of the guide of clusters: each part by itself, some of them twice."""
+
+    def run(number: int) -> int:
+        return lerobot([*COMMAND, "output_dir=out", f"shard={number}/4", "resume=true"])
+
+    assert [run(number) for number in (4, 1, 3, 1)] == [0] * 4
+    assert memobench(["merge", "out"]) == 1, "a part is missing"
+    assert [run(number) for number in (1, 2, 3, 4)] == [0] * 4
+    assert len(fake_loop.ran) == 8, "finished parts run no episode"
+    assert memobench(["merge", "out"]) == 0
     assert len(read_episodes(Path("out"))) == 8
 
 
@@ -202,7 +193,7 @@ def test_parts_repeat_the_command_and_decide_the_device_where_they_run(
     monkeypatch.setattr("torch.backends.mps.is_available", lambda: False)
     Path("eval.yaml").write_text("env: {horizon: 30}")
     words = ["memory_reads=true", "config_path=eval.yaml", "policy=memobench_strict", "workers=1"]
-    whole = plan_line([*LINE, *words, "shards=2", "slurm=--partition=a"])
+    whole = plan_line([*LINE, *words, "shards=2"])
     jobs = plan_shards(whole, ("program",), print)
     parts = [plan_line(job.arguments[1:]) for job in jobs]
     assert [str(part.options.shard) for part in parts] == ["1/2", "2/2"]
@@ -211,34 +202,12 @@ def test_parts_repeat_the_command_and_decide_the_device_where_they_run(
         assert part_plan.environment.horizon == 30
         assert part_plan.settings.policy.get("device") == (None if gpu else "cpu")
     assert not any("device" in word for job in jobs for word in job.arguments)
-    assert {job.at_once for job in jobs} == {1}  # a node of its own
+    assert {job.at_once for job in jobs} == {1}
     here = plan_shards(plan_line([*LINE, "shards=2"]), (), print)
     assert {job.at_once for job in here} == {2}
     assert here[0].episodes | here[1].episodes == {(task, k) for task in (STOVE, DRAWER) for k in range(4)}
     with pytest.raises(MemobenchError, match="4 batches"):
         plan_shards(plan_line([*LINE, "shards=9"]), (), print)
-
-
-@pytest.mark.parametrize(
-    ("parameters", "words", "needs"),
-    [
-        (900_000, [], (2, 8, 0)),
-        (3_500_000_000, [], (2, 36, 1)),  # 14 GB of weights, twice, plus 8 GB
-        (900_000, ["device=cuda"], (2, 8, 1)),
-        (3_500_000_000, ["device=cpu"], (2, 36, 0)),
-    ],
-)
-def test_slurm_needs_follow_the_policy(
-    fake_loop: FakeLoop,
-    parameters: int,
-    words: list[str],
-    needs: tuple[int, int, int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("lerobot_memobench.run.shards.parameters_of", lambda path: parameters)
-    slurm = slurm_of(plan_line([*LINE, "policy=memobench_strict", *words, "shards=2", "slurm=--partition=a"]))
-    assert slurm is not None
-    assert (slurm.needs.cores, slurm.needs.memory_gb, slurm.needs.gpus) == needs
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ def stating(key: str, value: Any) -> Callable[[Path], None]:
 
 
 def sealed(folder: Path) -> None:
-    """Move all seeds to the sealed ones, with a salt and the variants that both draw, without a commitment."""
+    """Move all seeds to the sealed ones, with a salt and the variants that both draw."""
 
     def move(records: list[Json]) -> None:
         for record in records:

@@ -103,7 +103,6 @@ def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
     import lerobot_policy_memobench  # noqa: F401 - LeRobot would find it by a search of all installed packages
 
     monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.chdir(tmp_path)
     fake = FakeLoop()
     monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)

@@ -14,7 +14,6 @@ from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
 from lerobot_memobench.io import checked, parsed
-from lerobot_memobench.protocol import PAPER
 from tools.board.check import RERUNS, ranked, read_board
 from tools.board.submission import Submission
 
@@ -31,7 +30,7 @@ class BoardRow:
         suite: with the referent where it is not the suite's default.
         assets: origin of the scenes' models.
         inputs: of the policy.
-        seeds: split, with the number of the run of a sealed one.
+        seeds: split.
         episodes: of each task.
         rates: average of SR, MSR, MUR and MCR.
         evidence: average over scenes that were run with each variant.
@@ -73,7 +72,6 @@ def board_row(
     if PAUSES in controls:
         changes = compare(run, controls[PAUSES].run, permutations=100).contrasts
     partner = next((each for each in others if each.name == submission.about.without_memory), None)
-    split = SEEDS[protocol["seed_base"]]
     return BoardRow(
         name=submission.name,
         about=submission.about,
@@ -82,7 +80,7 @@ def board_row(
         suite=" ".join([protocol["suite"], *(["random referents"] if protocol["referent"] == "random" else [])]),
         assets=f"LIBERO{', own objects for missing scans' if stand_ins_of(run.records) else ''}",
         inputs=protocol[INPUTS],
-        seeds=split if split == PAPER else f"{split}, run {evaluation.card['sealed']['run']}",
+        seeds=SEEDS[protocol["seed_base"]],
         episodes=protocol["episodes"],
         rates=run.summary.average,
         evidence=run.evidence.average if run.evidence else None,

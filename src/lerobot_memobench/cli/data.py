@@ -16,7 +16,6 @@ from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
-from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES
@@ -61,10 +60,6 @@ def generate(
     finish: Annotated[
         bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
     ] = False,
-    slurm: Annotated[
-        str | None,
-        typer.Option(help='Run on Slurm, with these options of sbatch: "--partition=cpu --time=8:00:00".'),
-    ] = None,
 ) -> int:
     """Make a LeRobotDataset of expert demonstrations. The same command continues a killed run."""
     if suite in LIBERO_SUITES:
@@ -72,13 +67,11 @@ def generate(
             f"--suite {suite}: LIBERO's tasks have no scripted expert, so no demonstrations can be made; its own are "
             "the dataset lerobot/libero"
         )
-    options = None if slurm is None else read_options(slurm)
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import episodes_of, slurm_of
+    from lerobot_memobench.datasets.generation import episodes_of
     from lerobot_memobench.datasets.generation import generate as run
 
-    cluster = None if options is None else slurm_of(out, options)
     screen = console()
     total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
     with counting(screen, "episodes", total) as count:
@@ -100,26 +93,21 @@ def generate(
             perturb=perturb,
             convention=convention,
             workers=workers,
-            slurm=cluster,
             finish=finish,
             progress=advance,
             notify=partial(screen.print, soft_wrap=True),
             **named,
         )
-    _print_summary(summary, out)
-    if cluster is not None and summary.submitted:
-        say(cluster.summary)
+    _print_summary(summary)
     return summary.exit_status
 
 
-def _print_summary(summary: GenerationSummary, out: Path) -> None:
+def _print_summary(summary: GenerationSummary) -> None:
     """Print the outcome of every seed and the place of the dataset."""
     console().print(Unbroken(_summary_table(summary)), crop=False)
     for failure in summary.failures:
         say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
-    if summary.submitted:
-        say(f"jobs are submitted; the last of them assembles the dataset in {out}")
-    elif summary.folder is None:
+    if summary.folder is None:
         say("no dataset was written: no seed was solved")
     else:
         say(f"dataset: {summary.folder}")

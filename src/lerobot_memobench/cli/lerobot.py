@@ -223,8 +223,7 @@ def evaluate_here(plan: EvaluationPlan) -> int:
 
 def evaluate_in_parts(plan: EvaluationPlan) -> int:
     """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
-    from lerobot_memobench.cli.lerobot import merge_and_print  # Slurm unpickles it; this module may be `__main__`
-    from lerobot_memobench.run.shards import plan_shards, run_shards, slurm_of
+    from lerobot_memobench.run.shards import plan_shards, run_shards
 
     jobs = plan_shards(plan, SHARD_PROGRAM, note)
     with counting(console(), "parts", len(jobs)) as count:
@@ -232,20 +231,8 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
         def advance(news: Advance) -> None:
             count(news.done, news.total, news.task_name, found=news.found)
 
-        report = run_shards(plan, jobs, advance, finish=merge_and_print)
-    if report is not None:
-        return print_report(report)
-    say(f"jobs are submitted; the last of them merges the parts in {plan.output.absolute()}")
-    if (slurm := slurm_of(plan)) is not None:
-        say(slurm.summary)
-    return 0
-
-
-def merge_and_print(out: Path, folders: Sequence[Path]) -> int:
-    """Merge parts into ``out`` and print the report; return 1 when episodes that were asked for are missing."""
-    from lerobot_memobench.run.shards import merge_and_report
-
-    return print_report(merge_and_report(out, folders))
+        report = run_shards(plan, jobs, advance)
+    return print_report(report)
 
 
 def print_report(run: Run) -> int:

@@ -253,8 +253,8 @@ def test_sealed(
         typer.Argument(help="As for `lerobot eval env=memobench`: policy=…, suite=…, tasks=….", metavar="policy=…"),
     ],
 ) -> int:
-    """Evaluate on the sealed seeds, and count the start. Seeds 100007 to 100056, once per release, when all settings
-    are chosen: output and card hold the number of this policy's run.
+    """Evaluate on the sealed seeds. Seeds 100007 to 100056, once per release, when all settings are chosen. The card
+    holds the salt, by which variants and holds can be drawn again.
     """
     from lerobot_memobench.cli.lerobot import run
 

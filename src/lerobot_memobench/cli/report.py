@@ -132,10 +132,10 @@ def merge(
     ] = None,
 ) -> int:
     """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
-    from lerobot_memobench.cli.lerobot import merge_and_print
-    from lerobot_memobench.run.shards import part_folders
+    from lerobot_memobench.cli.lerobot import print_report
+    from lerobot_memobench.run.shards import merge_and_report, part_folders
 
-    return merge_and_print(out, folders or part_folders(out))
+    return print_report(merge_and_report(out, folders or part_folders(out)))
 
 
 def rerun(

@@ -12,7 +12,6 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.jobs.slurm import Needs, Slurm
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
@@ -40,8 +38,6 @@ from lerobot_memobench.sim.libero.files import check_assets
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
-NEEDS = Needs(cores=1, memory_gb=4)
-"""Resources of one job on Slurm, which makes one episode after another."""
 FRAMES = {
     "published": {"temporal": 390, "spatial": 570, "object": 320, "procedural": 730},
     "strict": {"temporal": 530, "spatial": 860, "object": 330, "procedural": 750},
@@ -70,7 +66,6 @@ def generate(
     perturb: bool = False,
     convention: str = UPRIGHT,
     workers: int = 1,
-    slurm: Slurm | None = None,
     repo_id: str = DEFAULT_REPO_ID,
     finish: bool = False,
     progress: ProgressCallback | None = None,
@@ -87,8 +82,6 @@ def generate(
         out: destination.
         seed_base: episode i has the scene of seed ``seed_base`` + i.
         workers: episodes made at a time.
-        slurm: make them on Slurm (`slurm_of`); the call returns after submission, and the last job assembles the
-            dataset.
         finish: assemble the dataset of an unfinished run's episodes, and make no further episode.
         notify: called before the first episode with the approximate size and duration.
         referent, images, image_size, demonstration_prompt, perturb, convention: see `recording.RecordingSettings`.
@@ -118,15 +111,8 @@ def generate(
     plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, repo_id)
     if finish:
         return _finish_early(plan, Path(out))
-    if slurm is None:  # on Slurm, each job checks its own machine
-        check_assets()
-    return _run(plan, Path(out), workers, slurm=slurm, progress=progress, notify=notify)
-
-
-def slurm_of(out: Path, options: tuple[str, ...]) -> Slurm:
-    """Return Slurm settings for `generate`. Logs outlive the run, so their folder is next to the dataset."""
-    out = out.absolute()
-    return Slurm(options, NEEDS, out.with_name(f"{out.name}_slurm"))
+    check_assets()
+    return _run(plan, Path(out), workers, progress, notify)
 
 
 @dataclass(frozen=True)
@@ -186,15 +172,9 @@ class _Plan:
 
 
 def _run(
-    plan: _Plan,
-    out: Path,
-    workers: int = 1,
-    *,
-    slurm: Slurm | None = None,
-    progress: ProgressCallback | None = None,
-    notify: Callable[[str], None] = lambda _: None,
+    plan: _Plan, out: Path, workers: int, progress: ProgressCallback | None, notify: Callable[[str], None]
 ) -> GenerationSummary:
-    """Make the missing episodes, then the dataset; on Slurm a last job calls this again to make the dataset."""
+    """Make the missing episodes, then the dataset."""
     manifest = finished_manifest(out, plan.request)
     if manifest is not None:
         return summarise(manifest["episodes"], plan.tasks, out)
@@ -205,15 +185,7 @@ def _run(
     ):
         jobs = plan.jobs(folder)
         _report_size(plan, jobs, out, workers, notify)
-        complete = run_jobs(
-            jobs,
-            workers=workers,
-            progress=progress,
-            slurm=slurm,
-            finish=partial(_run, plan, out.absolute()),
-        )
-        if not complete:
-            return GenerationSummary(None, summarise([], plan.tasks, out).tasks, submitted=True)
+        run_jobs(jobs, workers=workers, progress=progress)
         return _assembled(plan, jobs, out, plan.request, plan.made_by)
 
 
@@ -359,14 +331,12 @@ class GenerationSummary:
     """Outcome of a run.
 
     Attributes:
-        folder: the dataset, or None if no episode succeeded or none was made yet.
+        folder: the dataset, or None if no episode succeeded.
         tasks: one entry per task, in the requested order.
-        submitted: whether the episodes are being made on Slurm, whose last job will assemble the dataset.
     """
 
     folder: Path | None
     tasks: tuple[TaskSummary, ...]
-    submitted: bool = False
 
     @property
     def failures(self) -> tuple[Failure, ...]:

@@ -145,48 +145,6 @@ class Start(TypedDict, total=False):
     times: Count
 
 
-class SealedStart(TypedDict):
-    """A start of an evaluation on the sealed seeds.
-
-    Attributes:
-        started: time.
-        suite: published or strict.
-        world: ``libero``; absent for the scenes that version 0.2 modelled in code.
-        referent: fixed, random or drawn.
-        replan_steps: actions executed per prediction; None for the policy's own number.
-        tasks: number of tasks.
-        episodes: number of episodes per task.
-    """
-
-    started: str
-    suite: Name
-    world: NotRequired[Name]
-    referent: Name
-    replan_steps: Count | None
-    tasks: Count
-    episodes: Count
-
-
-class SealedRun(TypedDict):
-    """The count of a policy's starts on the sealed seeds (`memobench test-sealed`).
-
-    Attributes:
-        started: time.
-        policy: hash of the files that the policy loads.
-        scenes: hash of task files, referent, seed, episodes and salt.
-        release: version of this package.
-        run: number of this start, from 1, among those of the policy with the release.
-        earlier: the starts before it.
-    """
-
-    started: NotRequired[str]
-    policy: NotRequired[str]
-    scenes: NotRequired[str]
-    release: str
-    run: Count
-    earlier: list[SealedStart]
-
-
 class CardEpisode(Outcome):
     """Outcome of an episode.
 
@@ -220,7 +178,6 @@ class Card(TypedDict):
         settings: format 2: settings of environment, policy and evaluation; `memobench rerun` repeats them.
         shard: part of a larger evaluation, or None.
         runs: each start, on each machine.
-        sealed: count of the evaluations on the sealed seeds.
         episodes: outcomes.
     """
 
@@ -235,7 +192,6 @@ class Card(TypedDict):
     settings: NotRequired[dict[str, Any]]
     shard: NotRequired[str | None]
     runs: NotRequired[Annotated[list[Start], MinLen(1)]]
-    sealed: NotRequired[SealedRun]
     episodes: NotRequired[list[CardEpisode]]
 
 

@@ -26,7 +26,7 @@ from lerobot_memobench.envs.episode_log import (
     not_run_record,
     read_log,
 )
-from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protocol
+from lerobot_memobench.envs.evaluation_file import write_protocol
 from lerobot_memobench.envs.interference import Interference
 from lerobot_memobench.envs.observations import (
     METADATA,
@@ -182,7 +182,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._number = number = seed - settings.seed_base
         scene, variant = scene_and_variant(self._task, number) if settings.evidence else (number, None)
         self._scene_seed = settings.seed_base + scene
-        _warn_of_sealed_seed(self._scene_seed, self._log_dir)
+        if self._scene_seed in SPLITS[SEALED] and settings.salt is None:
+            _warn_of_sealed_seeds()
         with self._ending_episode():
             self.episode.reset(self._scene_seed, variant, keep_prompt=named)
             if settings.interference:
@@ -440,16 +441,10 @@ def _black(settings: EnvSettings) -> NDArray[np.uint8]:
     return np.zeros((BAND + settings.observation_height, 2 * settings.observation_width, 3), np.uint8)
 
 
-def _warn_of_sealed_seed(seed: int, log_dir: Path | None) -> None:
-    """Log once per process that a sealed scene is used outside a counted run, which its evaluation's file names."""
-    if seed in SPLITS[SEALED] and (log_dir is None or "sealed" not in read_evaluation(log_dir)):
-        _log_sealed(SPLITS[SEALED])
-
-
 @cache
-def _log_sealed(split: range) -> None:
+def _warn_of_sealed_seeds() -> None:
+    """Log once per process that a sealed scene is used outside of the sealed test."""
+    seeds = SPLITS[SEALED]
     logger.warning(
-        "sealed scenes, not counted: seeds %d to %d are of the sealed test, whose runs `memobench test-sealed` counts",
-        split[0],
-        split[-1],
+        "seeds %d to %d are sealed: run them once per release, by `memobench test-sealed`", seeds[0], seeds[-1]
     )

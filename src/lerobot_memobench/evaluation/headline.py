@@ -77,10 +77,7 @@ def _seeds(run: Run) -> list[str]:
     first, last = min(logged), max(logged)
     seeds = f"seeds {first} to {last}" if len(logged) > 1 else f"seed {first}"
     name = next((name for name, split in SPLITS.items() if first in split and last in split), PAPER)
-    if name == PAPER:
-        return [seeds]
-    number = run.card.get("sealed", {}).get("run")
-    return [f"{seeds} ({name}{f', run {number} of this policy' if number else ''})"]
+    return [seeds if name == PAPER else f"{seeds} ({name})"]
 
 
 def extent_phrase(records: Sequence[Record]) -> str:

@@ -1,1 +1,1 @@
-"""How are many independent pieces of work run, here or on Slurm, and found finished again?"""
+"""Run many independent jobs in processes of this machine, and find finished jobs."""

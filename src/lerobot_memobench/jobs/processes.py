@@ -28,7 +28,7 @@ from lerobot_memobench.jobs.threads import ACTING, use_threads
 
 
 class Job(Protocol):
-    """A piece of work. It is pickled to other processes and machines, so ``folder`` is on a disk that they share."""
+    """A piece of work. It is pickled to worker processes."""
 
     @property
     def folder(self) -> Path:
@@ -65,25 +65,6 @@ class Advance:
 
 
 ProgressCallback = Callable[[Advance], None]
-
-
-MOST_NAMED = 5
-
-
-def check_finished(jobs: Sequence[Job], logs: Path) -> None:
-    """Refuse jobs that ended without a result, for example because they were killed.
-
-    Raises:
-        MemobenchError: names the jobs.
-    """
-    failed = [job.folder.name for job in jobs if not job.finished()]
-    if not failed:
-        return
-    names = ", ".join(failed[:MOST_NAMED]) + (f" and {len(failed) - MOST_NAMED} more" if failed[MOST_NAMED:] else "")
-    raise MemobenchError(
-        f"{len(failed)} of {len(jobs)} jobs ended without a result ({names}); "
-        f"see {logs}, then run the same command again (an evaluation with resume=true) for the missing jobs"
-    )
 
 
 def run_in_processes(jobs: Sequence[Job], workers: int, done: Callable[[Job], None]) -> None:
@@ -242,10 +223,10 @@ NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Errors of `flock` on disks without locks, as some clusters mount them."""
 
 
-def _lock(descriptor: int, blocking: bool = False) -> bool:
+def _lock(descriptor: int) -> bool:
     """Lock an open file or folder; return whether no other process holds the lock. A disk may have no locks."""
     try:
-        return lock_descriptor(descriptor, blocking=blocking)
+        return lock_descriptor(descriptor, blocking=False)
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise
@@ -279,16 +260,3 @@ def _is_at(folder: Path, descriptor: int) -> bool:
         return os.path.samestat(os.fstat(descriptor), folder.stat())
     except FileNotFoundError:
         return False
-
-
-@contextlib.contextmanager
-def taking_turns(path: Path, wait: Callable[[], None] = lambda: None) -> Iterator[None]:
-    """Hold the lock of a file; if another process of this machine holds it, call ``wait`` and wait.
-
-    The file stays; a killed process releases its lock.
-    """
-    with path.open("w") as file:
-        if not _lock(file.fileno()):
-            wait()
-            _lock(file.fileno(), blocking=True)
-        yield

@@ -1,40 +1,25 @@
-"""Run many independent jobs, such as episodes to generate, in processes here or on Slurm.
+"""Run many independent jobs, such as episodes to generate, in processes of this machine.
 
-The result is the same, because jobs do not depend on each other. Finished jobs are found on the disk, so running the
-same jobs again continues a killed run.
+Finished jobs are found on the disk, so running the same jobs again continues a killed run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from lerobot_memobench.jobs.processes import Advance, Job, ProgressCallback, run_in_processes
-from lerobot_memobench.jobs.slurm import Slurm
 
 
-def run_jobs(
-    jobs: Sequence[Job],
-    *,
-    workers: int = 1,
-    progress: ProgressCallback | None = None,
-    slurm: Slurm | None = None,
-    finish: Callable[[], Any] | None = None,
-) -> bool:
+def run_jobs(jobs: Sequence[Job], *, workers: int = 1, progress: ProgressCallback | None = None) -> None:
     """Run the jobs that are not finished yet.
 
     Args:
         jobs: the work.
         workers: number of jobs at a time.
         progress: called after each job; first for jobs that were finished before.
-        slurm: how to submit the jobs; None: run them here.
-        finish: called on Slurm, in a job of its own, after all jobs. It is pickled.
-
-    Returns:
-        Whether all jobs are finished; False if they were submitted.
 
     Raises:
-        MemobenchError: a worker was killed, or Slurm refuses the jobs.
+        MemobenchError: a worker was killed.
     """
     over = [job.finished() for job in jobs]
     finished = [job for job, is_over in zip(jobs, over, strict=True) if is_over]
@@ -49,13 +34,9 @@ def run_jobs(
 
     for job in finished:
         count(job)
-    if waiting and slurm is not None:
-        slurm.submit(waiting, workers, finish)
-        return False
     if workers > 1 and len(waiting) > 1:
         run_in_processes(waiting, workers, count)
     else:
         for job in waiting:
             job.run()
             count(job)
-    return True

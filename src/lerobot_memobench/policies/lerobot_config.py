@@ -19,10 +19,8 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.policies.checkpoint import cached_folder
 
-SEALED_LEDGER = "sealed_tests.jsonl"
-"""File in which `run.sealed` counts a policy's runs on the sealed seeds."""
 NOT_THE_CHECKPOINT = (
-    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes", SEALED_LEDGER),
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
     *("training_curve.png", "training_curve.json"),
 )
 """Files of a checkpoint folder that do not affect the policy's actions."""
@@ -156,19 +154,6 @@ def checkpoint_hash(path: str) -> str:
         return tree_hash(checkpoint_files(Path(path)))
     folder = cached_folder(path)
     return path if folder is None else f"{path}@{folder.name}"
-
-
-def parameters_of(path: str) -> int | None:
-    """Return the approximate number of parameters of a checkpoint: the size of its weights divided by four bytes.
-
-    Args:
-        path: folder or repository; the result is None for one that is not on this machine.
-    """
-    folder: Path | None = Path(path).expanduser()
-    if folder is not None and not folder.is_dir():
-        folder = cached_folder(path)
-    sizes = [] if folder is None else [file.stat().st_size for file in folder.glob("*model*.safetensors")]
-    return sum(sizes) // 4 if sizes else None
 
 
 def checkpoint_files(folder: Path) -> dict[str, str]:

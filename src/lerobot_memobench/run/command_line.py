@@ -64,7 +64,7 @@ SHORT_FORMS: dict[str, dict[str, tuple[str, ...]]] = {
     "train": {**COMMON, "episodes": ("dataset.episodes",)},
 }
 """Command -> short form -> the fields it sets, as far as they exist. `cli/lerobot.py` explains them."""
-RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers", "slurm")
+RUN_OPTIONS = ("split", "memory_reads", "resume", "shard", "shards", "workers")
 """Keys of `lerobot eval env=memobench` that LeRobot does not have (`plan.RunOptions`)."""
 TRAINING_OPTIONS = ("prompt_frames", "obs_type")
 """Keys of `lerobot train` that LeRobot does not have (`training.command.TrainingOptions`)."""

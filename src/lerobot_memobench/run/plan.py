@@ -19,7 +19,6 @@ from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.jobs.slurm import read_options
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
 from lerobot_memobench.policies.compatibility import check_features
@@ -152,6 +151,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     """
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
     from lerobot_memobench.run.settings import policy_of, with_policy
+    from lerobot_memobench.sim.libero.files import check_assets
 
     if options.resume and asked.output_dir is None:
         raise MemobenchError("resume=true needs the folder of the evaluation to resume: output_dir=<folder>")
@@ -176,10 +176,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     check_corruption(plan)
     check_split(plan)
     check_scenes(plan)
-    if options.slurm is None:  # there, each part checks its own machine
-        from lerobot_memobench.sim.libero.files import check_assets
-
-        check_assets()
+    check_assets()
     return plan
 
 
@@ -420,7 +417,7 @@ def earlier_batch_size(log: Path) -> int | None:
     return None if size is None else int(size)
 
 
-# --- how it is run: resume=, shard=, shards=, workers=, slurm= … ---
+# --- how it is run: resume=, shard=, shards=, workers= … ---
 
 
 @dataclass(frozen=True)
@@ -434,7 +431,6 @@ class RunOptions:
         shard: run this part alone.
         shards: run this many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
         workers: 0: as many as shards.
-        slurm: options of sbatch for jobs on Slurm; None: they run here.
     """
 
     split: str | None = None
@@ -443,7 +439,6 @@ class RunOptions:
     shard: Shard | None = None
     shards: int = 0
     workers: int = 0
-    slurm: tuple[str, ...] | None = None
 
     @property
     def in_parts(self) -> bool:
@@ -464,13 +459,11 @@ def take_run_options(words: Mapping[str, str]) -> tuple[RunOptions, dict[str, st
         shard=Shard.parse(words["shard"]) if "shard" in words else None,
         shards=_count("shards", words.get("shards")),
         workers=_count("workers", words.get("workers")),
-        slurm=read_options(words["slurm"]) if "slurm" in words else None,
     )
     if options.shards and options.shard is not None:
         raise MemobenchError(f"found shard={options.shard} and shards={options.shards}; give one of them")
-    idle = [key for key in ("workers", "slurm") if key in words]
-    if idle and not options.shards:
-        raise MemobenchError(f"found {idle[0]}= without shards=; give the number of parts, such as shards=8")
+    if options.workers and not options.shards:
+        raise MemobenchError("found workers= without shards=; give the number of parts, such as shards=8")
     return options, without(words, *RUN_OPTIONS)
 
 

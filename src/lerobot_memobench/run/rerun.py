@@ -142,8 +142,8 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     """Return the plan of a card's evaluation, to be run in ``out``, or in a folder of the present time."""
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])
-    options = RunOptions(split=SEALED if "sealed" in card else None, shard=shard)
-    asked = card["asked"].env_default(convention=UPRIGHT, salt=None)  # earlier cards do not name them
+    options = RunOptions(split=SEALED if card["asked"].env.get("salt") else None, shard=shard)
+    asked = card["asked"].env_default(convention=UPRIGHT)  # earlier cards do not name it
     return make_plan(replace(asked, output_dir=str(out)), options, ("memobench", "rerun"))
 
 

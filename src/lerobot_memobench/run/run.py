@@ -28,7 +28,6 @@ from lerobot_memobench.run.card import (
 )
 from lerobot_memobench.run.evaluate import Advance, evaluate
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, Shard
-from lerobot_memobench.run.sealed import counted
 
 VIDEOS = "videos"
 """Folder of the videos, in that of the log."""
@@ -80,7 +79,7 @@ def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note
 
     def begin() -> None:
         nonlocal card
-        card = counted(plan, with_checkpoint(card, plan.policy_path), note)
+        card = with_checkpoint(card, plan.policy_path)
         write_card(plan.log, card)
 
     write_card(plan.log, card)

@@ -1,7 +1,7 @@
 """Run the parts of an evaluation as jobs (``lerobot eval … shards=8``), and merge parts into one evaluation.
 
-A part is the same command with ``shard=i/n resume=true`` in a process of its own, here or on another machine that has
-the same folder. So a killed part is resumed, and a finished part is skipped.
+A part is the same command with ``shard=i/n resume=true`` in a process of its own. So a killed part is resumed, and a
+finished part is skipped.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,9 +26,7 @@ from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, refuse_links
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.jobs.slurm import Needs, Slurm
-from lerobot_memobench.jobs.threads import LARGE, sharing
-from lerobot_memobench.policies.lerobot_config import parameters_of
+from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.run.card import card_of, extended, first_variant_mismatch, with_episodes, write_card
 from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
@@ -58,7 +56,7 @@ class ShardJob:
         out: folder of the evaluation.
         episodes: (task, episode) of the part.
         directory: where relative paths are looked up.
-        at_once: parts that run at the same time on its machine.
+        at_once: parts that run at the same time.
     """
 
     program: tuple[str, ...]
@@ -68,7 +66,7 @@ class ShardJob:
     episodes: frozenset[tuple[str, int]]
     referent: str
     directory: Path
-    at_once: int = 1
+    at_once: int
 
     @property
     def folder(self) -> Path:
@@ -147,7 +145,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
     if options.shards > (batches := len(grid.cells())):
         raise MemobenchError(f"found shards={options.shards} and only {batches} batches of episodes; ask for fewer")
-    own = dict.fromkeys(("shards", "workers", "slurm", "output_dir", "resume"))
+    own = dict.fromkeys(("shards", "workers", "output_dir", "resume"))
     words = with_changes(plan.command[2:], **own, batch_size=plan.batch, salt=plan.environment.salt)
     jobs = [
         ShardJob(
@@ -158,7 +156,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
             referent=plan.environment.referent,
             directory=Path.cwd(),
-            at_once=1 if options.slurm is not None else min(options.workers or options.shards, options.shards),
+            at_once=min(options.workers or options.shards, options.shards),
         )
         for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
@@ -173,41 +171,12 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     return jobs
 
 
-def slurm_of(plan: EvaluationPlan) -> Slurm | None:
-    """Return how the parts are submitted to Slurm, None where they run here.
-
-    A large policy requests a GPU, and memory for its weights twice.
-    """
-    options, device = plan.options, plan.settings.policy.get("device")
-    if options.slurm is None:
-        return None
-    parameters = parameters_of(plan.policy_path) or 0 if plan.policy_path is not None else 0
-    on_gpu = device.startswith("cuda") if device else parameters >= LARGE
-    needs = Needs(cores=2, memory_gb=8 + 2 * 4 * parameters // 10**9, gpus=int(on_gpu))
-    return Slurm(options.slurm, needs, plan.output.absolute() / LOGS, jobs_per_member=1)
-
-
-def run_shards(
-    plan: EvaluationPlan,
-    jobs: Sequence[ShardJob],
-    progress: ProgressCallback,
-    finish: Callable[[Path, Sequence[Path]], Any],
-) -> Run | None:
-    """Run all parts, at once or some at a time, and merge them; return None where they were submitted to Slurm.
-
-    Args:
-        finish: called by Slurm's last job with the evaluation's folder and those of its parts. It is pickled.
-    """
-    options, out, folders = plan.options, plan.output.absolute(), [job.folder for job in jobs]
+def run_shards(plan: EvaluationPlan, jobs: Sequence[ShardJob], progress: ProgressCallback) -> Run:
+    """Run all parts, at once or some at a time, and merge them."""
+    out = plan.output.absolute()
     with made(out):
-        complete = run_jobs(
-            jobs,
-            workers=options.workers or len(jobs),
-            progress=progress,
-            slurm=slurm_of(plan),
-            finish=partial(finish, out, folders),
-        )
-        return _merge_and_report(out, [folder for folder in folders if has_log(folder)]) if complete else None
+        run_jobs(jobs, workers=plan.options.workers or len(jobs), progress=progress)
+        return _merge_and_report(out, [job.folder for job in jobs if has_log(job.folder)])
 
 
 # --- merging ---
