@@ -224,3 +224,10 @@ def test_hindsight_has_no_effect_before_training(trained: tuple[Any, dict[str, A
     assert not [name for name in still if name.startswith(("memory.", "foresight.")) and name != unseen]
     one, other = losses()
     assert one != pytest.approx(other)
+
+
+def test_motion_of_pictures_is_aligned(dataset_root: Path) -> None:
+    """Gradients of its convolutions are not contiguous."""
+    policy, before, _, dataset = made_for_training(dataset_root, size="small", memory="motion", align="contrastive")
+    _, logged = policy.train()(before(batch_of(dataset, [5, 9, 12, 15])))
+    assert logged["align_grad_norm"] > 0

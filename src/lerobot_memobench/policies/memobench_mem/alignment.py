@@ -14,7 +14,6 @@ import torch
 import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
-from torch.nn.utils import parameters_to_vector
 
 from lerobot_memobench.policies.memobench_mem.losses import joint, mean_over_ranks, world_size
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
@@ -199,7 +198,7 @@ def alignment_loss(
         # Cheap, and comparable with the gradient norm that LeRobot logs.
         gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True, materialize_grads=True)
         # The gradient of a rank is that of its own rows; DDP averages them.
-        logged["align_grad_norm"] = mean_over_ranks(parameters_to_vector(gradients)).norm().item()
+        logged["align_grad_norm"] = mean_over_ranks(torch.cat([each.reshape(-1) for each in gradients])).norm().item()
     with torch.no_grad():
         logged["align_top1"] = retrieval_accuracy(*map(joint, alignment.pairs(*usable)))
     return weighted, logged | alignment.numbers()
