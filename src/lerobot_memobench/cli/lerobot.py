@@ -136,9 +136,9 @@ def evaluate(words: Mapping[str, str]) -> int:
     suites = check_tasks(words)
     if len(suites) > 1:
         return evaluate_suites(suites, words)
-    from lerobot_memobench.run.plan import plan_line
+    from lerobot_memobench.run.plan import plan_words
 
-    plan = plan_line(spelled(words))
+    plan = plan_words(words)
     hint = f"resume with: {plan.resuming_command}"
     with (
         adding_resume_hint("lerobot", lambda: hint),

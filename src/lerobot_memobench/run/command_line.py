@@ -12,7 +12,7 @@ import re
 import typing
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
+from functools import cache, cached_property
 from importlib import metadata, resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -111,9 +111,12 @@ def without[T](words: Mapping[str, T], *keys: str) -> dict[str, T]:
 
 
 def check_names(command: str, words: Collection[str]) -> None:
-    """Refuse mistyped names without a dot before LeRobot is imported, which takes eight seconds.
+    """Refuse mistyped names without a dot, also before LeRobot is imported, which takes eight seconds.
 
     LeRobot's own names are read from the source of its configuration.
+
+    Raises:
+        MemobenchError: a name is unknown; it names the nearest known one.
     """
     source = Path(str(metadata.distribution("lerobot").locate_file(f"lerobot/configs/{command}.py")))
     if source.is_file():
@@ -144,14 +147,16 @@ class CommandSettings:
         config: the command's configuration class.
         words: LeRobot's full name of each setting on the command line -> its text or value.
         file: settings of the configuration file. config_path: the file's path, or its repository.
+        begun: configuration of the training whose checkpoint is the file; None for other files.
     """
 
     config: type
     words: Mapping[str, Any]
     file: Settings = field(default_factory=dict)
     config_path: str | None = None
+    begun: Any = None
 
-    @property
+    @cached_property
     def settings(self) -> Settings:
         """All settings; the command line overrides the file."""
         return merged(self.file, nested(self.words))
@@ -194,7 +199,8 @@ def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
     config = EvalPipelineConfig if command == "eval" else TrainPipelineConfig
     choices = registries(config)
     config_path = words.get(CONFIG_FILE)
-    file = _settings_of_file(config, config_path)
+    begun = _begun_training(config, config_path)
+    file = read_config_file(config_path) if begun is None else draccus.encode(begun)
     found: dict[str, Any] = {}
     for key in choices:  # `policy: act` in a file is `policy=act`
         if isinstance(file.get(key), str):
@@ -205,24 +211,25 @@ def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
         elif not key.endswith(f".{PACKAGES}") and key not in (CONFIG_FILE, HELP):
             found[key] = value
     for key in choices:
-        named = {name: found[full] for name in (TYPE, PATH) if (full := f"{key}.{name}") in found}
-        begun = file.get(key)
-        if named and isinstance(begun, Mapping) and {TYPE, PATH} & {*begun} and not named.items() <= begun.items():
+        named = {name: found[option] for name in (TYPE, PATH) if (option := f"{key}.{name}") in found}
+        there = file.get(key)
+        if named and isinstance(there, Mapping) and {TYPE, PATH} & {*there} and not named.items() <= there.items():
             del file[key]  # settings of another choice
     if "dataset.repo_id" in found and isinstance(file.get(DATASET), Mapping):
         file[DATASET] = without(file[DATASET], "root", "repo_id")
-    asked, short = CommandSettings(config, found, file, config_path), SHORT_FORMS[command]
-    for key in found:
-        if "." not in key and key not in (names := (*field_types(config), *short)):
-            raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, names)}")
-    for key in [key for key in found if key in short and key not in field_types(config)]:
+    check_names(command, found)
+    asked, short = CommandSettings(config, found, file, config_path, begun), SHORT_FORMS[command]
+    full: dict[str, Any] = {}
+    for key, value in found.items():
+        if key not in short or key in field_types(config):
+            full[key] = value
+            continue
         # replan= sets the policy's interval and the environment's, for the log; either may not exist.
-        kinds = {full: kind for full in short[key] if (kind := setting_kind(asked, full)) is not None}
+        kinds = {name: kind for name in short[key] if (kind := setting_kind(asked, name)) is not None}
         if not kinds:
             raise _without_field(asked, key, short[key][0])
-        found |= {full: value_of(key, kind, found[key]) for full, kind in kinds.items()}
-        del found[key]
-    return asked
+        full |= {name: value_of(key, kind, value) for name, kind in kinds.items()}
+    return replace(asked, words=full)
 
 
 def setting_kind(asked: CommandSettings, key: str) -> Any:
@@ -440,17 +447,19 @@ def read_config_file(given: str | None) -> Settings:
     return content
 
 
-def _settings_of_file(config: Any, given: str | None) -> Settings:
-    """Return the settings of a configuration file, or of a training's checkpoint in a folder or a repository."""
-    content = read_config_file(given)
-    if given is None or not hasattr(config, "from_pretrained") or (content and Path(given).suffix != ".json"):
-        return content
-    if content and not Path(given).is_dir() and Path(given).name != TRAIN_CONFIG:
-        return content
-    with quiet():  # LeRobot converts settings of its earlier versions
-        found = draccus.encode(config.from_pretrained(given))
-    assert isinstance(found, dict)
-    return found
+def _begun_training(config: Any, given: str | None) -> Any:
+    """Return the configuration of the training whose checkpoint a ``config_path`` names, None where it names none.
+
+    LeRobot finds it in a folder or a repository, and converts settings of its earlier versions.
+    """
+    if given is None or not hasattr(config, "from_pretrained"):
+        return None
+    path = Path(given).expanduser()
+    if path.is_file() and path.name != TRAIN_CONFIG:
+        return None
+    read_config_file(given)  # its errors name the file
+    with quiet():
+        return config.from_pretrained(path if path.exists() else given)
 
 
 # --- values of the fields of a configuration class ---

@@ -137,10 +137,15 @@ def with_changes(line: Sequence[str], **changes: object) -> list[str]:
 
 def plan_line(line: Sequence[str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation that ``lerobot eval <line>`` asks for."""
+    return plan_words(parse_words(line))
+
+
+def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
+    """Return the plan of the benchmark's evaluation for the words of a command line."""
     from lerobot_memobench.run.settings import read_settings
 
-    options, words = take_run_options(parse_words(line))
-    return make_plan(read_settings(words), options, ("lerobot", "eval", *line))
+    options, settings = take_run_options(words)
+    return make_plan(read_settings(settings), options, ("lerobot", "eval", *spelled(words)))
 
 
 def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:

@@ -21,7 +21,6 @@ from lerobot_memobench.policies.checkpoint import (
     read_json,
     text_of_link,
 )
-from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.run.command_line import (
     CONFIG_FILE,
     PATH,
@@ -146,7 +145,7 @@ def check_same_training(asked: CommandSettings, config: TrainPipelineConfig) -> 
     if checkpoint is None:
         return
     check_processors(checkpoint)
-    begun = begun_training(checkpoint)
+    begun = asked.begun
     _check_same_dataset(asked, begun, checkpoint)
     for name, value, held in changed_settings(asked, config, begun):
         if name.startswith(OF_OPTIMIZER):
@@ -157,14 +156,6 @@ def check_same_training(asked: CommandSettings, config: TrainPipelineConfig) -> 
             )
     if config.policy is not None and begun.policy is not None:
         check_as_begun(checkpoint, config.policy, begun.policy)
-
-
-def begun_training(checkpoint: Path) -> TrainPipelineConfig:
-    """Return the configuration with which a resumed training was begun."""
-    from lerobot.configs.train import TrainPipelineConfig
-
-    with quiet():
-        return TrainPipelineConfig.from_pretrained(checkpoint)
 
 
 def _check_same_dataset(asked: CommandSettings, begun: TrainPipelineConfig, checkpoint: Path) -> None:
@@ -203,7 +194,7 @@ def note_on_resume(asked: CommandSettings, config: TrainPipelineConfig) -> tuple
     checkpoint = _resumed_checkpoint(asked)
     if checkpoint is None:
         return None, True
-    begun, done = begun_training(checkpoint), step_reached(checkpoint)
+    begun, done = asked.begun, step_reached(checkpoint)
     if done >= config.steps:
         return (
             f"the training in {checkpoint.parents[2]} has finished its {done} steps; for more, set steps=",
