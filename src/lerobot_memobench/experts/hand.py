@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.controller import POSITION_SCALE, ROTATION_SCALE
-from lerobot_memobench.sim.robot import ARM_JOINTS
+from lerobot_memobench.sim.robot import ARM_JOINTS, POSITION_SCALE, ROTATION_SCALE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import STRICT
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import mujoco
 
-from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.sim.asset import Asset
 from lerobot_memobench.sim.libero.files import user_folders
 from lerobot_memobench.tasks.task import Task
@@ -19,9 +18,6 @@ AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
 AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
 AGENTVIEW_ANGLE = 45.0
 """Vertical field of view of the agentview camera, degrees."""
-
-PHYSICS_STEP = 0.002
-SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
 
 ARENA_BYTES = 32 * 2**20
 """Memory for contacts and constraints of one simulation."""

@@ -15,13 +15,11 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
 from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
 from lerobot_memobench.sim.libero.placement import Placer
 from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
-from lerobot_memobench.sim.libero.settling import settling_step
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer, translate_errors
-from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
+from lerobot_memobench.sim.scene import AGENTVIEW
 from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
@@ -119,7 +117,7 @@ class Simulation:
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList] | None = None
-        self._controller = make_controller(self.model)
+        self._controller = robot.Controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
@@ -187,7 +185,7 @@ class Simulation:
             if state is None:
                 self.step(NO_OP)
             else:
-                settling_step(self._controller, self.model, self.data, first=step == 0)
+                self._controller.settle(self.data, first=step == 0)
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
@@ -219,7 +217,7 @@ class Simulation:
         time = self.data.time
         self._start.mark_step()
         self._controller.set_goal(self.data, action)
-        self._controller.advance(self.data, float(action[6]), SUBSTEPS)
+        self._controller.advance(self.data, float(action[6]))
         self._check_physics(time)
         if self._hidden.absent:
             self._update_hidden()
@@ -445,7 +443,7 @@ class Simulation:
 
     def gripper_command(self) -> float:
         """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""
-        return float(self._controller.gripper @ CLOSING_SIGNS) / 2
+        return float(self._controller.gripper @ robot.CLOSING_SIGNS) / 2
 
     def body_pose(self, name: str) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of an instance or body."""
