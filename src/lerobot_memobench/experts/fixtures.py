@@ -127,14 +127,14 @@ def _handle_roll(hand: Hand, articulation: Articulation, tilt: float) -> float:
         ways = (_handle_target(hand, articulation, tilt, gap)() for gap in HANDLE_APPROACH)
         return max(hand_penetration(hand, "", way, rotation, HANDLE_MARGIN) for way in ways)
 
-    rolls = (0.0,) if articulation.handle.length < OPEN_WIDTH else (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL)
+    rolls = (0.0,) if articulation.handle_size[0] < OPEN_WIDTH else (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL)
     return min(rolls if hand.strict else rolls[:1], key=collision)
 
 
 def open_drawer(hand: Hand, region: str) -> Steps:
     """Grasp a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    steep = HANDLE_TILT if articulation.handle.length < OPEN_WIDTH else WIDE_HANDLE_TILT
+    steep = HANDLE_TILT if articulation.handle_size[0] < OPEN_WIDTH else WIDE_HANDLE_TILT
     tilt = steep + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(MAX_ATTEMPTS):
         out = opening_direction(hand, articulation)
@@ -325,7 +325,7 @@ def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) ->
     """Return the grasp position on a door's upper edge (3,), m."""
     articulation, _ = hand.sim.world.articulation(name)
     owner = _owner(hand, name)
-    depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
+    depth = articulation.clearance + articulation.handle_size[1] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - DOOR_EDGE_INSET * along
     edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
     return edge
@@ -368,7 +368,7 @@ def close_door(hand: Hand, name: str) -> Steps:
 def _pull_door(hand: Hand, name: str) -> Steps:
     """Grasp the upper end of a vertical handle and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    up = (articulation.handle_size[0] / 2 - HANDLE_GRIP_DEPTH) * UP
     flip = _closing_sign(door_geometry(hand, name).along)
 
     def at(height: float, ahead: float = 0.0) -> Callable[[], Array]:
@@ -493,7 +493,7 @@ def _sweep_rotation(hand: Hand, door: Door, place: Array, flip: float) -> Array:
 
 def _sweep_open(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    up = (articulation.handle_size[0] / 2 - HANDLE_GRIP_DEPTH) * UP
     flip = _closing_sign(door_geometry(hand, name).along)
 
     def grip(ahead: float = 0.0) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.asset import COLLISION_GROUP, Articulation, split_class
-from lerobot_memobench.sim.libero.mjcf import known_classes
+from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from mujoco_raster.highlights import Highlight

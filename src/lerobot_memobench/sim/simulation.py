@@ -15,13 +15,11 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
-from lerobot_memobench.sim.libero.placement import Placer
-from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
+from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer, translate_errors
-from lerobot_memobench.sim.scene import AGENTVIEW
+from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, get_scene
 from lerobot_memobench.sim.scene_hash import scene_hash
-from lerobot_memobench.sim.world import StartState, World
+from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
 from mujoco_raster.drawlist import DrawList, Image

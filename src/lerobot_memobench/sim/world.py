@@ -7,6 +7,7 @@ predicates that compare the present state with the start of the execution.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import isnan
 from typing import Any
 
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.asset import COLLISION_GROUP, TABLE, Articulation, Asset
-from lerobot_memobench.sim.detents import DEAD_CENTRE
+from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 ON_DISTANCE = 0.03
 """Horizontal distance of origins below which one object counts as on another, m."""
@@ -50,7 +51,7 @@ DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
 """Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 
 
-def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+def in_region(place: Array, position: Array, rotation: Array, size: Array) -> bool:
     """Return whether an origin is in a region.
 
     LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
@@ -65,7 +66,7 @@ def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -
     return bool(np.all(place > low) and np.all(place < high))
 
 
-def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
+def over_region(place: Array, position: Array, rotation: Array, size: Array) -> bool:
     """Return whether an origin is on top of a region, with or without contact; arguments as of `in_region`.
 
     LIBERO applies the site's rotation where its inverse would be correct.
@@ -182,7 +183,7 @@ class World:
         on_table = declared is not None and declared.target not in self._instances
         return on_table or self.touching(a, self._owner_of(region))
 
-    def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:
+    def _box_of(self, region: str) -> tuple[Array, Array, Array]:
         """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = self._site(region)
         return (
@@ -227,11 +228,11 @@ class StartState:
         self._fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         arm = np.arange(max(self._fingers) + 1)  # arm and fingers are first in the model, with one position a joint
         self._arm_indices = np.concatenate([arm, model.nq + arm])
-        self._previous: NDArray[np.float64] | None = None
+        self._previous: Array | None = None
         self._bodies = {name: int(model.body(name).id) for name in objects}
         self._joints = joints
-        self._places: dict[str, NDArray[np.float64]] = {}
-        self._turns: dict[str, NDArray[np.float64]] = {}
+        self._places: dict[str, Array] = {}
+        self._turns: dict[str, Array] = {}
         self.mark_hand()
         self.mark_scene()
 
@@ -241,7 +242,7 @@ class StartState:
         self._position, self._rotation, self._opening = self._hand()
 
     @property
-    def home(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def home(self) -> tuple[Array, Array]:
         """Position (3,) and rotation (3, 3) of the grip site at home."""
         return self._position, self._rotation
 
@@ -293,7 +294,7 @@ class StartState:
             all(self._joint_shift(name) <= DEAD_CENTRE[self._joints[name][0].kind] for name in self._joints)
         )
 
-    def _is_or_was_equal(self, state: NDArray[np.float64], part: Any = ...) -> bool:
+    def _is_or_was_equal(self, state: Array, part: Any = ...) -> bool:
         """Return whether part of the state equals ``state`` now or did at the beginning of the step."""
         states = [self._current_state()] if self._previous is None else [self._current_state(), self._previous]
         return any(bool(np.abs(one[part] - state).max() <= SAME_STATE) for one in states)
@@ -324,7 +325,7 @@ class StartState:
         address = self._joints[name][1]
         return abs(float(self._data.qpos[address] - self._start_state[address]))
 
-    def _current_state(self) -> NDArray[np.float64]:
+    def _current_state(self) -> Array:
         """Return positions and velocities of the whole scene."""
         return np.append(self._data.qpos, self._data.qvel)
 
@@ -344,15 +345,80 @@ class StartState:
         cosine = (np.trace(self._rotation.T @ rotation) - 1.0) / 2.0
         return float(np.linalg.norm(position - self._position)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
-    def _speed(self) -> NDArray[np.float64]:
+    def _speed(self) -> Array:
         """Return the speed of the grip site (2,), m/s and rad/s."""
         velocity = np.empty(6)  # angular part first
         site = mujoco.mjtObj.mjOBJ_SITE
         mujoco.mj_objectVelocity(self._model, self._data, site, self._grip, velocity, 0)
         return np.array([np.linalg.norm(velocity[3:]), np.linalg.norm(velocity[:3])])
 
-    def _hand(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _hand(self) -> tuple[Array, Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site, and finger positions (2,)."""
         data = self._data
         rotation = data.site_xmat[self._grip].reshape(3, 3).copy()
         return data.site_xpos[self._grip].copy(), rotation, data.qpos[self._fingers].copy()
+
+
+PARKING_HEIGHT = 1000.0
+"""Height of parked objects, m, plus 1 m times the body's number: outside the cameras' range, without contact."""
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenObject:
+    """An absent object.
+
+    Attributes:
+        name: object.
+        region: region of its drawer.
+        offset: (3,) position relative to the region's site, m.
+        quaternion: (4,) orientation wxyz.
+    """
+
+    name: str
+    region: str
+    offset: Array
+    quaternion: Array
+
+
+class HiddenObjects:
+    """Park hidden objects of a simulation, and put each into its drawer when that is ajar.
+
+    Args:
+        model, data: model and data of the simulation.
+
+    Attributes:
+        absent: objects that are parked.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        self.absent: tuple[HiddenObject, ...] = ()
+
+    def describe(self, name: str, region: str) -> HiddenObject:
+        """Return an object that rests in a drawer, with its present pose relative to the drawer."""
+        body, site = self._data.body(name), self._data.site(region)
+        return HiddenObject(name, region, body.xpos - site.xpos, body.xquat.copy())
+
+    def park(self) -> None:
+        """Write the poses of absent objects; the derived quantities of ``data`` are not updated."""
+        for hidden in self.absent:
+            height = PARKING_HEIGHT + self._model.body(hidden.name).id
+            self._write(hidden.name, np.array([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+
+    def reveal(self, regions: Sequence[str]) -> list[str]:
+        """Put absent objects into the drawers of ``regions``, with the drawers' velocities; return their names."""
+        found = [hidden for hidden in self.absent if hidden.region in regions]
+        self.absent = tuple(hidden for hidden in self.absent if hidden not in found)
+        for hidden in found:
+            velocity = np.empty(6)  # angular part first
+            site = self._data.site(hidden.region)
+            mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_SITE, site.id, velocity, 0)
+            self._write(hidden.name, np.concatenate([site.xpos + hidden.offset, hidden.quaternion]), velocity[3:])
+        return [hidden.name for hidden in found]
+
+    def _write(self, name: str, pose: Array, velocity: Array) -> None:
+        """Set pose (7,) and linear velocity (3,), m/s, of an object."""
+        joint = self._model.joint(int(self._model.body(name).jntadr[0]))
+        qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+        self._data.qpos[qpos : qpos + 7] = pose
+        self._data.qvel[dof : dof + 6] = [*velocity, 0.0, 0.0, 0.0]

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.asset import Asset
-from lerobot_memobench.sim.libero.arenas import arena_of
-from lerobot_memobench.sim.libero.classes import Turn, parts_of
-from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
+from lerobot_memobench.sim.classes import Turn, arena_of
+from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -133,9 +132,9 @@ class Placer:
     def _parts(self, atom: Atom) -> dict[str, tuple[float, float]]:
         """Return joint -> range of an atom's predicate, for all parts of a fixture or the part of a region."""
         found = {
-            f"{instance}_{part.joint}": part.ranges[atom.predicate]
+            part.joint: part.ranges[atom.predicate]
             for instance, asset in self._assets.items()
-            for region, part in parts_of(asset.class_name)
+            for region, part in asset.articulations.items()
             if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
         }
         if not found:

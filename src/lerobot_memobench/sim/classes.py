@@ -1,7 +1,7 @@
-"""Table of LIBERO's classes: MJCF file, and data from LIBERO's Python code.
+"""Tables of LIBERO's classes and arenas: MJCF files, and data from LIBERO's Python code.
 
-Numbers are facts of LIBERO's code (`envs/objects`, MIT licence): initial rotations of its samplers, joint ranges that
-count as open, closed, on and off, and positions of handles.
+Numbers are facts of LIBERO's code (`envs/objects`, `envs/problems`, `envs/arenas`, `envs/robots`, MIT licence): initial
+rotations of its samplers, joint ranges that count as open, closed, on and off, positions of handles, rooms and tables.
 """
 
 from __future__ import annotations
@@ -9,35 +9,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import nan, pi
 
-from lerobot_memobench.sim.asset import ALONG_X, ALONG_Y, Grasp, JointRule
+from lerobot_memobench.sim.asset import (
+    ALONG_X,
+    ALONG_Y,
+    TABLE,
+    TABLE_SIZE,
+    TABLE_TOP,
+    Articulation,
+    Grasp,
+    Quaternion,
+    Triple,
+)
+from lerobot_memobench.sim.robot import BASE_POSITION
+from lerobot_memobench.tasks.task import Task
 
 Turn = tuple[str, float, float]
 """Axis (x, y or z), and the range of the angle, rad."""
 UPRIGHT: Turn = ("x", 0.0, 0.0)
 QUARTER: Turn = ("x", pi / 2, pi / 2)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Part(JointRule):
-    """A drawer, door or knob of a fixture.
-
-    Attributes:
-        joint: name of the joint.
-        body: name of the moving body.
-        handle: centre of the handle in that body's frame, m.
-        handle_quaternion: rotation from the handle's frame (x along it, y into the fixture) to the body's, wxyz.
-        handle_size: length of the handle, and its thickness along y and z, m.
-        clearance: free space behind the handle, m.
-        ranges: `init` predicate -> range of initial joint positions, m or rad.
-    """
-
-    joint: str
-    body: str
-    handle: tuple[float, float, float]
-    handle_size: tuple[float, float, float]
-    clearance: float
-    ranges: dict[str, tuple[float, float]]
-    handle_quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -56,7 +45,7 @@ class LiberoClass:
 
     mjcf: str
     turns: tuple[Turn, ...] = (QUARTER,)
-    parts: tuple[tuple[str, Part], ...] = ()
+    parts: tuple[tuple[str, Articulation], ...] = ()
     grasps: tuple[Grasp, ...] = ()
     floor: float = nan
     clear: float = nan
@@ -85,8 +74,8 @@ _DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
 """Drawer -> height of its handle, m."""
 
 
-def _drawer(level: str, height: float) -> Part:
-    return Part(
+def _drawer(level: str, height: float) -> Articulation:
+    return Articulation(
         kind="drawer",
         joint=f"{level}_level",
         body=f"cabinet_{level}",
@@ -104,7 +93,7 @@ def _drawer(level: str, height: float) -> Part:
 
 _DRAWER_PARTS = tuple((f"{level}_region", _drawer(level, height)) for level, height in _DRAWERS.items())
 """Drawers of the wooden and of the white cabinet, which differ in colour and in parts of a millimetre."""
-_DOOR = Part(
+_DOOR = Articulation(
     kind="door",
     joint="microjoint",
     body="microdoorroot",
@@ -118,7 +107,7 @@ _DOOR = Part(
     open_below=-1.3,
     closed_above=-0.005,
 )
-_KNOB = Part(
+_KNOB = Articulation(
     kind="knob",
     joint="button",
     body="button",
@@ -201,8 +190,110 @@ SUITE_CLASSES: dict[str, LiberoClass] = {
 }
 """Classes of LIBERO's own suites only, which object observations do not contain."""
 ALL_CLASSES = CLASSES | SUITE_CLASSES
+UNKNOWN_CLASS = LiberoClass("")
+"""A scan or a user's class; only its bounding box is known."""
 
 
-def parts_of(class_name: str) -> tuple[tuple[str, Part], ...]:
-    """Return the parts of a class; objects and scans have none."""
-    return ALL_CLASSES[class_name].parts if class_name in ALL_CLASSES else ()
+# --- arenas ---
+
+AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
+AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
+AGENTVIEW_ANGLE = 45.0
+"""Vertical field of view of the agentview camera, degrees."""
+LOW_VIEW = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
+"""Quaternion wxyz of the agentview camera in the arenas without a mount."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arena:
+    """A room with a table.
+
+    Attributes:
+        file: path of its MJCF file below the assets folder.
+        floor, wall: textures, below the folder ``textures``.
+        body: body of the table, which carries the sites of its regions.
+        zones: origin of the regions of these sites in that body's frame, m.
+        origin: origin of the regions from which placements are drawn, m.
+        fixture_drop: height of a placed fixture's origin above ``origin``, m.
+        inset: whether an object's whole outline is drawn inside its region.
+        lays_out: whether LIBERO's code sets the sizes of the table, those of the kitchen.
+        friction: friction of that table; by default that of the file.
+        base: position of the arm's base, m.
+        mounted: whether the arm stands on its mount.
+        camera_position, camera_quaternion: pose of the agentview camera, m and wxyz.
+    """
+
+    file: str
+    floor: str = "light-gray-floor-tile.png"
+    wall: str = "light-gray-plaster.png"
+    body: str
+    zones: Triple
+    origin: Triple
+    fixture_drop: float = 0.01 - TABLE_SIZE[2]
+    inset: bool = False
+    lays_out: bool = False
+    friction: Triple | None = None
+    base: Triple = BASE_POSITION
+    mounted: bool = True
+    camera_position: Triple = AGENTVIEW_POSITION
+    camera_quaternion: Quaternion = AGENTVIEW_QUATERNION
+
+
+ARENAS: dict[str, Arena] = {
+    TABLE: Arena(
+        file="scenes/libero_kitchen_tabletop_base_style.xml",
+        floor="gray_ceramic_tile.png",
+        wall="yellow_linen_wall_texture.png",
+        body="table",
+        zones=(0.0, 0.0, 0.0),
+        origin=(0.0, 0.0, TABLE_TOP),
+        lays_out=True,
+    ),
+    "table": Arena(
+        file="scenes/libero_tabletop_base_style.xml",
+        body="table",
+        zones=(0.0, 0.0, 0.02),
+        origin=(0.0, 0.0, TABLE_TOP),
+        inset=True,
+        lays_out=True,
+        friction=(0.6, 0.005, 0.0001),
+    ),
+    "living_room_table": Arena(
+        file="scenes/libero_living_room_tabletop_base_style.xml",
+        floor="seamless_wood_planks_floor.png",
+        body="living_room_table",
+        zones=(0.0, 0.0, 0.41),
+        origin=(0.0, 0.0, 0.41),
+        fixture_drop=0.01 - 0.024,
+        base=(-0.51, 0.0, 0.42),
+        mounted=False,
+        camera_position=(0.6065773716836134, 0.0, 0.96),
+        camera_quaternion=LOW_VIEW,
+    ),
+    "study_table": Arena(
+        file="scenes/libero_study_base_style.xml",
+        body="study_table",
+        zones=(-0.2, 0.0, 0.867),
+        origin=(-0.2, 0.0, 0.867),
+        base=(-0.75, 0.0, 0.0),
+        camera_position=(0.4586131746834771, 0.0, 1.6103500240372423),
+    ),
+    "floor": Arena(
+        file="scenes/libero_floor_base_style.xml",
+        body="floor",
+        zones=(0.0, 0.0, 0.02),
+        origin=(0.0, 0.0, -0.035),
+        fixture_drop=-0.025,
+        inset=True,
+        base=(-0.6, 0.0, 0.0),
+        mounted=False,
+        camera_position=(0.8965773716836134, 5.216182733499864e-07, 0.65),
+        camera_quaternion=LOW_VIEW,
+    ),
+}
+"""Class of the table or floor in a task's file -> arena."""
+
+
+def arena_of(task: Task) -> Arena:
+    """Return the arena of a task, the kitchen for a task without a table."""
+    return next((ARENAS[name] for name in task.fixtures.values() if name in ARENAS), ARENAS[TABLE])
