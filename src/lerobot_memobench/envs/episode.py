@@ -37,8 +37,13 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
+from lerobot_memobench.sim.simulation import (
+    InvalidActionError,
+    RenderSettings,
+    Simulation,
+    UnstablePhysicsError,
+    as_action,
+)
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import Choice

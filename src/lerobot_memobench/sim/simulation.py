@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import reprlib
-from collections.abc import Callable, Sequence
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -16,14 +20,17 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
-from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer, translate_errors
-from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, get_scene
+from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
 from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
-from mujoco_raster.drawlist import DrawList, Image
+from mujoco_raster.drawlist import Image
+from mujoco_raster.errors import RasterError
 from mujoco_raster.highlights import Highlight
+
+if TYPE_CHECKING:
+    from mujoco_raster.rasterizer import Rasterizer
 
 Array = NDArray[np.float64]
 
@@ -35,6 +42,12 @@ MAX_SCENES = 200
 """Maximum number of draws of a strict scene."""
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """No motion, gripper open."""
+
+DEFAULT, HIGH = "default", "high"
+QUALITIES = (DEFAULT, HIGH)
+"""``high`` is for figures and videos: a pixel is the mean of four, at four times the cost."""
+CACHED_RASTERIZERS = 4
+"""Rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB."""
 
 
 class InvalidActionError(MemobenchError):
@@ -64,6 +77,44 @@ def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
             f"an action contains a value that is not finite: {array.tolist()}; check the policy's output"
         )
     return array
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Size and quality of frames; see `QUALITIES`."""
+
+    height: int = 256
+    width: int = 256
+    quality: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        if self.quality not in QUALITIES:
+            raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
+        if self.height < 1 or self.width < 1:
+            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; use sizes of 1 or more")
+
+
+class _RasterizerCache(threading.local):
+    """Rasterizers of a thread, by scene and size; one serves one thread at a time."""
+
+    def __init__(self) -> None:
+        self.rasterizers: OrderedDict[tuple[object, ...], Rasterizer] = OrderedDict()
+
+
+_cache = _RasterizerCache()
+
+
+def get_rasterizer(scene: Scene, height: int, width: int) -> Rasterizer:
+    """Return this thread's rasterizer of a scene, created on first use and shared by simulations of the scene."""
+    from mujoco_raster.rasterizer import Rasterizer  # loads numba
+
+    key, cached = (scene.key, height, width), _cache.rasterizers
+    if key not in cached:
+        while len(cached) >= CACHED_RASTERIZERS:
+            cached.popitem(last=False)
+        cached[key] = Rasterizer(*scene.drawing(), width, height)
+    cached.move_to_end(key)
+    return cached[key]
 
 
 @dataclass(frozen=True)
@@ -114,7 +165,7 @@ class Simulation:
         self.caught_at_home, self.settled = False, True
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
-        self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList] | None = None
+        self._drawn: tuple[mujoco.MjModel, mujoco.MjData] | None = None
         self._controller = robot.Controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
@@ -365,36 +416,44 @@ class Simulation:
 
     def render(self, camera: str = "agentview") -> Image:
         """Return the image of a camera (`agentview` or `wrist`), (height, width, 3) uint8, upright."""
-        model, data, draw_list = self._drawing()
-        for asset, geom in self._glowing:
-            lit = self.holds(Atom("turnon", (asset.name,)))
-            model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
-        renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
-        with translate_errors():
-            return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
+        from mujoco_raster.rasterizer import mean_of_four  # loads numba
+
+        fine = self.render_settings.quality == HIGH
+        with self._rasterizer(2 if fine else 1) as (rasterizer, model, data):
+            for asset, geom in self._glowing:
+                lit = self.holds(Atom("turnon", (asset.name,)))
+                model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
+            image = rasterizer.draw(model, data, _mjcf_camera(camera), self.highlights)
+        return mean_of_four(image) if fine else image
 
     def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
-        model, data, draw_list = self._drawing()
-        rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
-        with translate_errors():
+        with self._rasterizer() as (rasterizer, model, data):
             geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
         return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
-    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList]:
-        """Return the scene's visual model in the present pose, its data, and its draw list."""
+    @contextlib.contextmanager
+    def _rasterizer(self, scale: int = 1) -> Iterator[tuple[Rasterizer, mujoco.MjModel, mujoco.MjData]]:
+        """Return a rasterizer, with the visual model and its data in the present pose."""
+        size = self.render_settings
+        model, data = self._drawing()
+        try:
+            yield get_rasterizer(self._scene, scale * size.height, scale * size.width), model, data
+        except RasterError as error:
+            raise MemobenchError(str(error)) from error
+
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         if self._drawn is None:
-            drawing, listed = self._scene.drawing()
-            drawing = copy.copy(drawing)
-            self._drawn = drawing, mujoco.MjData(drawing), listed
-        model, data, draw_list = self._drawn
+            model = copy.copy(self._scene.drawing()[0])
+            self._drawn = model, mujoco.MjData(model)
+        model, data = self._drawn
         for name, pose in self.fixture_poses().items():
             body = model.body(name).id
             model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
         data.qpos[:] = self.data.qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return model, data, draw_list
+        return model, data
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
