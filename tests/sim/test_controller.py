@@ -25,8 +25,7 @@ class Arm:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data, self.controller = model, mujoco.MjData(model), robot.Controller(model)
-        for names, start in (robot.ARM_JOINTS, robot.ARM_START), (robot.FINGER_JOINTS, robot.GRIPPER_START):
-            self.data.qpos[[int(model.joint(name).qposadr[0]) for name in names]] = start
+        self.data.qpos[: robot.OTHERS.start] = [*robot.ARM_START, *robot.GRIPPER_START]
         mujoco.mj_step1(model, self.data)
         self.controller.reset(self.data)
 
@@ -86,7 +85,7 @@ class Reference(robot.Controller):
         mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._site)
         arguments = (data, full) if robot.FULLM_READS_DATA else (full, data.qM)
         mujoco.mj_fullM(self._model, *arguments)
-        jacobian, mass, velocity = jacobian[:, self._dofs], full[self._dofs, self._dofs], data.qvel[self._dofs]
+        jacobian, mass, velocity = jacobian[:, robot.ARM], full[robot.ARM, robot.ARM], data.qvel[robot.ARM]
         turn = product(self.goal_rotation, data.site_xmat[self._site].reshape(3, 3).T)
         error = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         twist = product(jacobian, velocity)
@@ -95,10 +94,10 @@ class Reference(robot.Controller):
         columns = solution(mass, jacobian.T)
         inverse = product(jacobian, columns)
         wrench = np.concatenate([solution(inverse[:3, :3], force), solution(inverse[3:, 3:], torque)])
-        pull = NULLSPACE_KP * (self._home - data.qpos[self._qposs]) - NULLSPACE_KD * velocity
+        pull = NULLSPACE_KP * (self._home - data.qpos[robot.ARM]) - NULLSPACE_KD * velocity
         posture = product(mass, pull)
         wrench -= solution(inverse, product(columns.T, posture))
-        return product(jacobian.T, wrench) + data.qfrc_bias[self._dofs] + posture
+        return product(jacobian.T, wrench) + data.qfrc_bias[robot.ARM] + posture
 
     def advance(
         self, data: mujoco.MjData, gripper_action: float, substeps: int = robot.SUBSTEPS, *, gravity_only: bool = False
@@ -106,9 +105,9 @@ class Reference(robot.Controller):
         change = robot.CLOSING_SIGNS * robot.GRIPPER_SPEED * np.sign(gripper_action)
         (low, high), (shut, wide) = self._torque_limits, self._finger_range
         for _ in range(substeps):
-            data.ctrl[self._arm] = np.clip(self.torques(data), low, high)
+            data.ctrl[robot.ARM] = np.clip(self.torques(data), low, high)
             self.gripper = np.clip(self.gripper + change, -1.0, 1.0)
-            data.ctrl[self._fingers] = (wide + shut) / 2 + (wide - shut) / 2 * self.gripper
+            data.ctrl[robot.FINGERS] = (wide + shut) / 2 + (wide - shut) / 2 * self.gripper
             mujoco.mj_step2(self._model, data)
             mujoco.mj_step1(self._model, data)
 
@@ -150,6 +149,14 @@ def test_compiled_steps_equal_numpy(simulate: Callable[..., Simulation], task: s
 
 
 # --- the carried arm ---
+
+
+def test_the_robot_comes_first_in_a_scene(simulate: Callable[..., Simulation]) -> None:
+    model = simulate(BOWLS).model
+    joints = [model.joint(name) for name in (*robot.ARM_JOINTS, *robot.FINGER_JOINTS)]
+    assert [joint.qposadr[0] for joint in joints] == [joint.dofadr[0] for joint in joints] == [*range(9)]
+    assert [model.actuator(k).trnid[0] for k in range(9)] == [joint.id for joint in joints]
+
 
 CARRIED = "e36735ac29316c701c722f5d41b46efc854356d1fdbc46ce611cbd1f02a5262b"
 """Hash of the names and contents that scripts/robosuite_arm.py writes."""

@@ -31,8 +31,8 @@ GRIPPER_OPEN = (0.04, -0.04)
 the finger positions do not reveal the time since they were closed."""
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-ARM_ACTUATORS = tuple(f"robot0_torq_j{i}" for i in range(1, 8))
-FINGER_ACTUATORS = ("gripper0_gripper_finger_joint1", "gripper0_gripper_finger_joint2")
+ARM, FINGERS, OTHERS = slice(0, 7), slice(7, 9), slice(9, None)
+"""Arm, fingers and other joints in qpos and qvel, the first two also in ctrl: the robot comes first in each model."""
 GRIP_SITE = "gripper0_grip_site"
 HAND_BODY = "robot0_right_hand"
 WRIST_CAMERA = "robot0_eye_in_hand"
@@ -82,14 +82,9 @@ class Controller:
 
         self._write_controls = write_controls
         self._model = model
-        # The arm comes first in the model, so its values are slices, which are cheaper than index arrays.
-        first = model.joint(ARM_JOINTS[0])
-        self._dofs, self._qposs = (slice(int(at[0]), int(at[0]) + 7) for at in (first.dofadr, first.qposadr))
-        arm, fingers = model.actuator(ARM_ACTUATORS[0]).id, model.actuator(FINGER_ACTUATORS[0]).id
-        self._arm, self._fingers = slice(arm, arm + 7), slice(fingers, fingers + 2)
         self._site = model.site(GRIP_SITE).id
-        self._torque_limits = model.actuator_ctrlrange[self._arm].T.copy()
-        self._finger_range = model.actuator_ctrlrange[self._fingers].T.copy()
+        self._torque_limits = model.actuator_ctrlrange[ARM].T.copy()
+        self._finger_range = model.actuator_ctrlrange[FINGERS].T.copy()
         self._home = np.array(ARM_START)
         self._jacobian, self._mass = np.zeros((6, model.nv)), np.zeros((model.nv, model.nv))
         self.goal_position: Array = np.zeros(3)
@@ -123,12 +118,12 @@ class Controller:
         Before and after, ``data`` is in the state after `mujoco.mj_step1`.
         """
         change = CLOSING_SIGNS * (GRIPPER_SPEED * np.sign(gripper_action))
-        gripper, site, jacobian, mass, dofs = self.gripper.copy(), self._site, self._jacobian, self._mass, self._dofs
+        gripper, site, jacobian, mass = self.gripper.copy(), self._site, self._jacobian, self._mass
         linear, angular = jacobian[:3], jacobian[3:]
         # Views in each call: a copied simulation has its own memory.
-        state = data.qpos[self._qposs], data.qvel[dofs], data.qfrc_bias[dofs], jacobian[:, dofs], mass[dofs, dofs]
+        state = data.qpos[ARM], data.qvel[ARM], data.qfrc_bias[ARM], jacobian[:, ARM], mass[ARM, ARM]
         pose = data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self.goal_position, self.goal_rotation
-        arm, fingers = (self._torque_limits, data.ctrl[self._arm]), (self._finger_range, data.ctrl[self._fingers])
+        arm, fingers = (self._torque_limits, data.ctrl[ARM]), (self._finger_range, data.ctrl[FINGERS])
         for _ in range(substeps):
             mujoco.mj_jacSite(self._model, data, linear, angular, site)
             if FULLM_READS_DATA:

@@ -153,7 +153,7 @@ class Simulation:
         self._scene = scene
         self._strict = task.suite == STRICT
         self.model: mujoco.MjModel = copy.copy(scene.model)
-        # Disable robosuite's unused force and torque sensors, which cost time in each physics step.
+        # robosuite's force and torque sensors are unused, but cost time in each physics step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
@@ -170,8 +170,6 @@ class Simulation:
         self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
-        self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
-        self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
         self._glowing = [(asset, geom) for asset in scene.assets.values() for geom in asset.glow]
 
@@ -217,10 +215,10 @@ class Simulation:
     def _set_up(
         self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
     ) -> dict[str, Array]:
-        """Set one draw of the initial state, run the stabilisation steps, and return objects' places before them."""
+        """Return the objects' positions before the stabilisation steps."""
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self._arm_qpos] = robot.ARM_START
-        self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
+        self.data.qpos[robot.ARM] = robot.ARM_START
+        self.data.qpos[robot.FINGERS] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
         self._placer.place(seed, draw)
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
@@ -241,11 +239,9 @@ class Simulation:
         return places
 
     def _has_settled(self, places: dict[str, Array]) -> bool:
-        """Return whether objects rest where they were placed, and nothing moves."""
-        others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
         shifts = [self.data.body(name).xpos[:2] - place[:2] for name, place in places.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
-        return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[others:]).max(initial=0.0)) <= SETTLED_SPEED
+        return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED
 
     def begin_execution(self) -> None:
         """Store the present state as the reference of the atoms in `SINCE_START`."""
@@ -280,7 +276,6 @@ class Simulation:
                 self._put_back(self._at_home, arm_only=True)
 
     def _update_hidden(self) -> None:
-        """Keep absent objects parked; put those whose drawer is ajar into it."""
         ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
         revealed = self._hidden.reveal(ajar)
         self._hidden.park()
@@ -307,8 +302,8 @@ class Simulation:
         self.restore(start)
         if arm_only:
             self._hidden.absent = absent
-            others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
-            self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
+            others = robot.OTHERS
+            self.data.qpos[others], self.data.qvel[others] = qpos[others], qvel[others]
             mujoco.mj_step1(self.model, self.data)
         else:
             self._start.mark_objects(self.absent)
@@ -318,7 +313,7 @@ class Simulation:
 
     @property
     def state_dim(self) -> int:
-        """Length of `state()`: 1 + nq + nv of the compiled model."""
+        """Length of `state()`."""
         return int(1 + self.model.nq + self.model.nv)
 
     @property
@@ -371,10 +366,8 @@ class Simulation:
         physics = np.empty(self.physics_dim)
         mujoco.mj_getState(self.model, self.data, physics, self._full)
         controller = self._controller
-        position, rotation = controller.goal_position.copy(), controller.goal_rotation.copy()
-        return Snapshot(
-            physics, position, rotation, controller.gripper.copy(), self._start.goes_on, self._hidden.absent
-        )
+        goal = controller.goal_position.copy(), controller.goal_rotation.copy(), controller.gripper.copy()
+        return Snapshot(physics, *goal, self._start.goes_on, self._hidden.absent)
 
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
         """Restore a snapshot of this simulation, bit for bit.
@@ -395,7 +388,7 @@ class Simulation:
         """Restore the state before a demonstration prompt, without the hidden objects.
 
         Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
-        objects are absent until their drawers are ajar (`sim.hiding`).
+        objects are absent until their drawers are ajar (`HiddenObjects`).
 
         Args:
             start: state before the prompt.
@@ -458,7 +451,7 @@ class Simulation:
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
         position, rotation_vector = self.data.site_xpos[self._grip], axis_angle(self.data.xquat[self._hand])
-        return np.concatenate([position, rotation_vector, self.data.qpos[self._finger_qpos]]).astype(np.float32)
+        return np.concatenate([position, rotation_vector, self.data.qpos[robot.FINGERS]]).astype(np.float32)
 
     def robot_state(self) -> dict[str, dict[str, Array]]:
         """Return hand, fingers and joints as in LeRobot's ``libero``, float64.
@@ -467,11 +460,11 @@ class Simulation:
         ``qpos`` and ``qvel`` (2,); ``joints``: ``pos`` and ``vel`` (7,).
         """
         position, rotation = self.eef_pose()
-        qpos, qvel, fingers, arm = self.data.qpos, self.data.qvel, self._finger_qpos, self._arm_qpos
-        return {  # arm and fingers come first in the model, so that qvel has their places of qpos
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        return {
             "eef": {"pos": position, "quat": self.data.xquat[self._hand, [1, 2, 3, 0]], "mat": rotation},
-            "gripper": {"qpos": qpos[fingers], "qvel": qvel[fingers]},
-            "joints": {"pos": qpos[arm], "vel": qvel[arm]},
+            "gripper": {"qpos": qpos[robot.FINGERS], "qvel": qvel[robot.FINGERS]},
+            "joints": {"pos": qpos[robot.ARM], "vel": qvel[robot.ARM]},
         }
 
     def eef_pose(self) -> tuple[Array, Array]:
@@ -495,8 +488,8 @@ class Simulation:
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""
-        fingers = self.data.qpos[self._finger_qpos]
-        return float(fingers[0] - fingers[1])
+        one, other = self.data.qpos[robot.FINGERS]
+        return float(one - other)
 
     def gripper_command(self) -> float:
         """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""
