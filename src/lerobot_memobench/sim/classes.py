@@ -29,12 +29,18 @@ UPRIGHT: Turn = ("x", 0.0, 0.0)
 QUARTER: Turn = ("x", pi / 2, pi / 2)
 
 
+BOTTLE: tuple[Turn, ...] = (QUARTER, ("z", pi / 2, pi / 2))
+SCANNED, GROCERY, MODELLED = "stable_scanned_objects", "stable_hope_objects", "turbosquid_objects"
+FIXTURE = "articulated_objects"
+"""Folders of MJCF files below the assets folder."""
+
+
 @dataclass(frozen=True)
 class LiberoClass:
     """Class of an object or fixture.
 
     Attributes:
-        mjcf: path of its file below the assets folder.
+        folder: folder of its MJCF file.
         turns: initial rotations, applied in order; fixtures are rotated as stated by the task.
         parts: pairs of region and part; the region is "" if atoms use the fixture's name.
         grasps: top-down grasps; by default at the sides of the bounding box.
@@ -43,7 +49,7 @@ class LiberoClass:
         y_up: whether the object's y axis points up; grasps are in the frame with z up (`scene.Y_UP`).
     """
 
-    mjcf: str
+    folder: str
     turns: tuple[Turn, ...] = (QUARTER,)
     parts: tuple[tuple[str, Articulation], ...] = ()
     grasps: tuple[Grasp, ...] = ()
@@ -52,22 +58,19 @@ class LiberoClass:
     round: bool = False
     y_up: bool = False
 
-
-def _vessel(name: str, rim: Grasp, floor: float, clear: float) -> LiberoClass:
-    file = f"stable_scanned_objects/{name}/{name}.xml"
-    return LiberoClass(file, grasps=(rim,), floor=floor, clear=clear, round=True)
-
-
-def _grocery(name: str, *turns: Turn, grasps: tuple[Grasp, ...], y_up: bool = False) -> LiberoClass:
-    return LiberoClass(f"stable_hope_objects/{name}/{name}.xml", turns, grasps=grasps, y_up=y_up)
-
-
-def _modelled(name: str, grasps: tuple[Grasp, ...] = ()) -> LiberoClass:
-    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (UPRIGHT,), grasps=grasps)
+    def mjcf(self, class_name: str) -> str:
+        """Return the path of the class's file below the assets folder."""
+        return (
+            f"{self.folder}/{class_name}.xml"
+            if self.folder == FIXTURE
+            else f"{self.folder}/{class_name}/{class_name}.xml"
+        )
 
 
-def _rim(radius: float, height: float, width: float) -> Grasp:
-    return Grasp((radius, 0.0, height), ALONG_X, width, symmetric=True)
+def _bowl(radius: float, height: float, width: float, *, floor: float, clear: float) -> LiberoClass:
+    """Return a class whose rim of this radius, height and width is grasped."""
+    rim = Grasp((radius, 0.0, height), ALONG_X, width, symmetric=True)
+    return LiberoClass(SCANNED, grasps=(rim,), floor=floor, clear=clear, round=True)
 
 
 _DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
@@ -124,69 +127,52 @@ _KNOB = Articulation(
 )
 
 CLASSES: dict[str, LiberoClass] = {
-    "akita_black_bowl": _vessel("akita_black_bowl", _rim(0.0498, 0.044, 0.006), floor=0.0068, clear=0.039),
-    "white_bowl": _vessel("white_bowl", _rim(0.0372, 0.0275, 0.005), floor=0.0042, clear=0.022),
-    "plate": _vessel("plate", _rim(0.0625, 0.0125, 0.012), floor=0.0061, clear=0.040),
+    "akita_black_bowl": _bowl(0.0498, 0.044, 0.006, floor=0.0068, clear=0.039),
+    "white_bowl": _bowl(0.0372, 0.0275, 0.005, floor=0.0042, clear=0.022),
+    "plate": _bowl(0.0625, 0.0125, 0.012, floor=0.0061, clear=0.040),
     "chefmate_8_frypan": LiberoClass(
-        "stable_scanned_objects/chefmate_8_frypan/chefmate_8_frypan.xml",
+        SCANNED,
         grasps=tuple(Grasp((x, 0.0, 0.0442 + 0.126 * (x - 0.1926)), ALONG_Y, 0.0254) for x in (0.145, 0.165, 0.195)),
         floor=0.0128,
         clear=0.072,
     ),
-    "bbq_sauce": _grocery(
-        "bbq_sauce",
-        QUARTER,
-        grasps=(Grasp((0.0, 0.0, 0.0195), ALONG_Y, 0.0286), Grasp((0.0, 0.0, 0.0195), ALONG_X, 0.0362)),
+    "bbq_sauce": LiberoClass(
+        GROCERY, grasps=(Grasp((0.0, 0.0, 0.0195), ALONG_Y, 0.0286), Grasp((0.0, 0.0, 0.0195), ALONG_X, 0.0362))
     ),
-    "butter": _grocery(
-        "butter", UPRIGHT, grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
+    "butter": LiberoClass(
+        GROCERY, (UPRIGHT,), grasps=(Grasp((0.0, 0.0, 0.0), ALONG_Y, 0.0396), Grasp((0.0, 0.0, 0.0), ALONG_X, 0.0762))
     ),
-    "milk": _grocery(
-        "milk",
-        QUARTER,
-        ("z", pi / 2, pi / 2),
+    "milk": LiberoClass(
+        GROCERY,
+        BOTTLE,
         grasps=(Grasp((0.0, 0.0, 0.029), ALONG_X, 0.0526), Grasp((0.0, 0.0, 0.029), ALONG_Y, 0.0526)),
         y_up=True,
     ),
-    "ketchup": _grocery(
-        "ketchup",
-        QUARTER,
-        ("z", pi / 2, pi / 2),
+    "ketchup": LiberoClass(
+        GROCERY,
+        BOTTLE,
         grasps=(Grasp((0.0004, -0.0008, 0.0405), ALONG_Y, 0.0366), Grasp((0.0004, -0.0008, 0.0405), ALONG_X, 0.033)),
         y_up=True,
     ),
-    "moka_pot": _modelled("moka_pot", (Grasp((0.0, 0.0755, 0.045), ALONG_X, 0.0131),)),
-    "wooden_two_layer_shelf": _modelled("wooden_two_layer_shelf"),
-    "wooden_cabinet": LiberoClass("articulated_objects/wooden_cabinet.xml", parts=_DRAWER_PARTS),
-    "microwave": LiberoClass("articulated_objects/microwave.xml", parts=(("", _DOOR),)),
-    "flat_stove": LiberoClass("articulated_objects/flat_stove.xml", parts=(("", _KNOB),)),
+    "moka_pot": LiberoClass(MODELLED, (UPRIGHT,), grasps=(Grasp((0.0, 0.0755, 0.045), ALONG_X, 0.0131),)),
+    "wooden_two_layer_shelf": LiberoClass(MODELLED, (UPRIGHT,)),
+    "wooden_cabinet": LiberoClass(FIXTURE, parts=_DRAWER_PARTS),
+    "microwave": LiberoClass(FIXTURE, parts=(("", _DOOR),)),
+    "flat_stove": LiberoClass(FIXTURE, parts=(("", _KNOB),)),
 }
 
-
-def _upright_grocery(name: str, *turns: Turn) -> LiberoClass:
-    return _grocery(name, *turns, grasps=(), y_up=True)
-
-
-def _turned(name: str, low: float, high: float) -> LiberoClass:
-    return LiberoClass(f"turbosquid_objects/{name}/{name}.xml", (("x", low, high),))
-
-
-_TURNED_CAN: Turn = ("z", pi / 2, pi / 2)
-_BOTTLE = QUARTER, ("z", pi / 2, pi / 2)
-
 SUITE_CLASSES: dict[str, LiberoClass] = {
-    **{name: _upright_grocery(name, _TURNED_CAN) for name in ("alphabet_soup", "tomato_sauce")},
-    **{name: _upright_grocery(name, *_BOTTLE) for name in ("new_salad_dressing", "orange_juice", "salad_dressing")},
-    **{name: _grocery(name, UPRIGHT, grasps=()) for name in ("chocolate_pudding", "cream_cheese")},
-    "cookies": _grocery("cookies", QUARTER, grasps=()),
-    **{
-        name: LiberoClass(f"stable_scanned_objects/{name}/{name}.xml")
-        for name in ("basket", "glazed_rim_porcelain_ramekin")
-    },
-    **{name: _modelled(name) for name in ("desk_caddy", "wine_bottle", "wine_rack", "wooden_tray")},
-    **{name: _turned(name, -pi / 2, -pi / 4) for name in ("black_book", "yellow_book")},
-    **{name: _turned(name, -pi / 2, -pi / 2) for name in ("porcelain_mug", "red_coffee_mug", "white_yellow_mug")},
-    "white_cabinet": LiberoClass("articulated_objects/white_cabinet.xml", parts=_DRAWER_PARTS),
+    **dict.fromkeys(("alphabet_soup", "tomato_sauce"), LiberoClass(GROCERY, BOTTLE[1:], y_up=True)),
+    **dict.fromkeys(("new_salad_dressing", "orange_juice", "salad_dressing"), LiberoClass(GROCERY, BOTTLE, y_up=True)),
+    **dict.fromkeys(("chocolate_pudding", "cream_cheese"), LiberoClass(GROCERY, (UPRIGHT,))),
+    "cookies": LiberoClass(GROCERY),
+    **dict.fromkeys(("basket", "glazed_rim_porcelain_ramekin"), LiberoClass(SCANNED)),
+    **dict.fromkeys(("desk_caddy", "wine_bottle", "wine_rack", "wooden_tray"), LiberoClass(MODELLED, (UPRIGHT,))),
+    **dict.fromkeys(("black_book", "yellow_book"), LiberoClass(MODELLED, (("x", -pi / 2, -pi / 4),))),
+    **dict.fromkeys(
+        ("porcelain_mug", "red_coffee_mug", "white_yellow_mug"), LiberoClass(MODELLED, (("x", -pi / 2, -pi / 2),))
+    ),
+    "white_cabinet": LiberoClass(FIXTURE, parts=_DRAWER_PARTS),
 }
 """Classes of LIBERO's own suites only, which object observations do not contain."""
 ALL_CLASSES = CLASSES | SUITE_CLASSES
