@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.expert import Expert, blind_routine
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     CAMERAS,

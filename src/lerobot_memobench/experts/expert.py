@@ -136,16 +136,11 @@ def _merge_plans(plans: list[list[Step]]) -> list[Step]:
     """Return one plan that contains all plans, with shared steps once."""
     whole: list[Step] = []
     for plan in plans:
-        if not _is_subsequence(plan, whole):
+        left = iter(whole)
+        if not all(step in left for step in plan):
             common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
             whole += plan[common:]
     return whole
-
-
-def _is_subsequence(plan: list[Step], whole: list[Step]) -> bool:
-    """Return whether the steps of a plan occur in another plan, in order."""
-    left = iter(whole)
-    return all(step in left for step in plan)
 
 
 class Expert:
@@ -306,3 +301,22 @@ class Expert:
         held = yield from pick(self.hand, name, avoid=out)
         if held is not None:
             yield from put_in_drawer(self.hand, held, region, out)
+
+
+def blind_routine(task: Task, sim: Simulation, rng: np.random.Generator) -> Steps:
+    """Reach a published task's goal, return home and repeat, forever: a baseline without memory.
+
+    No state is kept between rounds, so the routine cannot count. It ignores prompt and instruction, and so hidden and
+    indicated objects.
+
+    Args:
+        task: published task; for a strict task the one it is derived from.
+        sim: running simulation; the hand's pose at the first action is home.
+        rng: random source of small variations.
+    """
+    home = sim.eef_pose()
+    while True:
+        expert = Expert(task, sim, rng)
+        while not expert.done:
+            yield expert.act()
+        yield from come_home(expert.hand, *home)

@@ -287,7 +287,6 @@ class Door:
     """Present geometry of a hinged door. Directions are horizontal unit vectors (3,), positions are (3,), m."""
 
     q: float
-    hinge: Array
     handle: Array
     outward: Array
     """Normal of the door's front."""
@@ -309,31 +308,13 @@ def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     outward = outward if outward @ opening > 0 else -outward
     along = cross(UP, outward)
     along = along if along @ lever > 0 else -along
-    edge = _edge(hand, name, handle, outward, along)
-    turn = Rotation.from_rotvec(joint.xaxis * ahead)
-    return Door(
-        q + ahead,
-        hinge,
-        hinge + turn.apply(lever),
-        turn.apply(outward),
-        turn.apply(along),
-        hinge + turn.apply(edge - hinge),
-    )
-
-
-def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) -> Array:
-    """Return the grasp position on a door's upper edge (3,), m."""
-    articulation, _ = hand.sim.world.articulation(name)
-    owner = _owner(hand, name)
+    owner = max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
     depth = articulation.clearance + articulation.handle_size[1] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - DOOR_EDGE_INSET * along
     edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
-    return edge
-
-
-def _owner(hand: Hand, name: str) -> str:
-    """Return the fixture of an articulation's name (``microwave_1``, ``cabinet_1_top_region``)."""
-    return max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
+    turned = Rotation.from_rotvec(joint.xaxis * ahead).apply
+    handle, edge = hinge + turned(lever), hinge + turned(edge - hinge)
+    return Door(q + ahead, handle, turned(outward), turned(along), edge)
 
 
 def door_is_at_goal(q: float, articulation: Articulation, opening: bool) -> bool:
