@@ -147,18 +147,7 @@ class Expert:
     """Solve a task: achieve its checkpoints in order, then the goal's remaining atoms.
 
     A goal that counts events defines the plan itself, because the present state does not show past events. The expert
-    reads the simulator state and returns one action per control step.
-
-    Args:
-        task: task with goal and checkpoints.
-        sim: running simulation.
-        rng: random source of small variations in speed, grasp and approach.
-
-    Attributes:
-        done: whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
-            because policies trained on it cannot observe the step in which the goal becomes true.
-        succeeded: whether the goal held at the last call of `act`.
-        hand: controlled arm.
+    reads the state of a running simulation and returns one action per control step; speed, grasps and approaches vary.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
@@ -167,7 +156,11 @@ class Expert:
         self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
         self._started = False
         self._motion = self._plan()
-        self.done = self.succeeded = False
+        self.done = False
+        """Whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
+        because policies trained on it cannot observe the step in which the goal becomes true."""
+        self.succeeded = False
+        """Whether the goal held at the last call of `act`."""
 
     def act(self) -> NDArray[np.float32]:
         """Return the action (7,) for the present state; after the plan come to rest with open fingers.
@@ -252,11 +245,10 @@ class Expert:
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
         middle = self.sim.asset_pose(support)[0] if on_object else self._region_top(support)
-        place = middle - self.sim.assets[name].bottom * UP
         drawer = drawer_containing(self.hand, name)
         if drawer is not None:
             yield from self.achieve(Atom("open", (drawer,)))
-        held = yield from pick(self.hand, name, place=place)
+        held = yield from pick(self.hand, name, place=middle - self.sim.assets[name].bottom * UP)
         if held is not None and on_object:
             yield from put_on(self.hand, held, support)
         elif held is not None:
@@ -272,23 +264,16 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, half[2]])
 
     def _open(self, name: str) -> Steps:
+        # Not `Hand.strict`: the blind routine solves a published task in a strict scene.
         door = sweep_door_open if self.task.suite == STRICT else open_door
-        return (door if self._is_door(name) else open_drawer)(self.hand, name)
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
         door = sweep_door_shut if self.task.suite == STRICT else close_door
-        return (door if self._is_door(name) else close_drawer)(self.hand, name)
-
-    def _is_door(self, name: str) -> bool:
-        return self.sim.world.articulation(name)[0].kind == "door"
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else close_drawer)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:
-        drawers = [
-            full
-            for asset in self.sim.assets.values()
-            for part, full in asset.regions.items()
-            if part in asset.articulations
-        ]
+        drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]
         if region not in drawers:
             known = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
             raise MemobenchError(
