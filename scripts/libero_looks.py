@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_memobench.sim.libero.scene import scene_xml
-from lerobot_memobench.sim.scene import ARENA_BYTES
+from lerobot_memobench.sim.scene import ARENA_BYTES, scene_xml
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import Task

@@ -1,4 +1,4 @@
-"""Record values that stock LIBERO computes for the published tasks, for the tests of `sim.libero`.
+"""Record values that stock LIBERO computes for the published tasks, for the tests of `sim`.
 
     PYTHONPATH=src:. LIBERO/bin/python scripts/libero_records.py models scenes predicates rollouts --out FOLDER
 
@@ -24,8 +24,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.libero.files import OWN_OBJECTS
-from lerobot_memobench.sim.libero.mjcf import class_file, parse_numbers
+from lerobot_memobench.sim.files import OWN_OBJECTS
+from lerobot_memobench.sim.mjcf import class_file, parse_numbers
 from lerobot_memobench.tasks.task import STRICT
 
 SEEDS = range(7, 57)

@@ -19,9 +19,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.libero import placement
-from lerobot_memobench.sim.libero.scene import get_scene
-from lerobot_memobench.sim.scene import SUBSTEPS
+from lerobot_memobench.sim import placement
+from lerobot_memobench.sim.robot import SUBSTEPS
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_tasks
@@ -180,8 +180,8 @@ def watched_start(sim: Simulation) -> Sequence[tuple[NDArray[Any], NDArray[Any]]
     moments: deque[tuple[NDArray[Any], NDArray[Any]]] = deque(maxlen=3)
     advance = sim._controller.advance
 
-    def watched(*args: Any) -> None:
-        advance(*args)
+    def watched(*args: Any, **options: Any) -> None:
+        advance(*args, **options)
         moments.append((sim.proprio(), sim.data.qpos.copy()))
 
     with patch.object(sim._controller, "advance", watched):

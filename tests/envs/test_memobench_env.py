@@ -99,8 +99,7 @@ def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise AssertionError("something is rendered")
 
-    for name in ("get_renderer", "get_rasterizer"):
-        monkeypatch.setattr(f"lerobot_memobench.sim.simulation.{name}", refuse)
+    monkeypatch.setattr("lerobot_memobench.sim.simulation.get_rasterizer", refuse)
 
 
 # --- the contract ---

@@ -29,7 +29,7 @@ from lerobot_memobench.run.plan import (
     take_run_options,
 )
 from lerobot_memobench.run.settings import EvaluationSettings
-from lerobot_memobench.sim.libero import files
+from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 
 BARE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4"]

@@ -14,7 +14,7 @@ import pytest
 from lerobot_memobench import doctor
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero import fetch, files
+from lerobot_memobench.sim import files
 from tests.support.hub_server import Hub
 
 CONTENT = {"scenes/kitchen.xml": b"<mujoco/>", "stable_scanned_objects/plate/texture.png": b"white", "wood.png": b"oak"}
@@ -229,10 +229,10 @@ def test_download_and_copy(hub: Hub, home: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_damaged_download_is_fetched_again(hub: Hub, home: Path) -> None:
-    folder = fetch.obtain().folder
+    folder = files.obtain().folder
     (folder / PLATE).resolve().write_bytes(b"black")
     files._verified.cache_clear()
-    assert fetch.obtain() == files.Place(files.HUB_CACHE, folder, "")
+    assert files.obtain() == files.Place(files.HUB_CACHE, folder, "")
     assert files.asset(PLATE).read_bytes() == CONTENT[PLATE]
 
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from mujoco_raster.highlights import Highlight
 from mujoco_raster.rasterizer import Rasterizer
@@ -51,7 +50,7 @@ def test_frames_do_not_depend_on_caches(task: str) -> None:
     settings = RenderSettings(128, 128)
     sims = [Simulation(get_task(task), settings) for _ in range(2)]
     sims[0].reset(7)
-    drawing, _, draw_list = sims[0]._drawing()
+    drawing, draw_list = sims[0]._scene.drawing()
     others = {
         most: Rasterizer(drawing, listed, 128, 128)
         for most, listed in {0: draw_list, 2: replace(draw_list, still=0)}.items()
@@ -62,7 +61,7 @@ def test_frames_do_not_depend_on_caches(task: str) -> None:
                 ours = sim.render(name).astype(int)
                 for most, other in others.items():
                     other._still.clear()
-                    model, data, _ = sim._drawing()
+                    model, data = sim._drawing()
                     off = np.abs(ours - other.draw(model, data, camera, sim.highlights))
                     assert off.max() <= most, f"{state}, {name}"
 

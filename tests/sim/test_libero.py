@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.libero.scene import get_scene
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.libero.scene import get_scene
-from lerobot_memobench.sim.scene import SUBSTEPS
+from lerobot_memobench.sim.robot import SUBSTEPS
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import atoms
 from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks

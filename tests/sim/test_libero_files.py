@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero import files, mjcf
-from lerobot_memobench.sim.libero.scene import build_scene
+from lerobot_memobench.sim import files, mjcf
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.tasks.catalogue import get_task
 
 TOMATO = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
@@ -42,13 +42,13 @@ def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
 def test_user_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     task = get_task(TOMATO)
     monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
-    assert build_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
+    assert get_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
     scan_folder(tmp_path, "beefsteak_tomato", ("aaa", "bbb"))
     monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
     with pytest.raises(MemobenchError, match="no folder 'box_of_oatmeal'"):
-        build_scene(task)
+        get_scene(task)
     scan_folder(tmp_path, "box_of_oatmeal", ("a", "b", "c", "d"))
-    scene = build_scene(task)
+    scene = get_scene(task)
     assert scene.stand_ins == ()
     tomato = "beefsteak_tomato__1_1"
     (touched,) = (scene.model.geom_bodyid == scene.model.body(tomato).id).nonzero()[0]

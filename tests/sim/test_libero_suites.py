@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero.arenas import ARENAS, arena_of
-from lerobot_memobench.sim.libero.classes import CLASSES, SUITE_CLASSES
+from lerobot_memobench.sim.classes import ARENAS, CLASSES, SUITE_CLASSES, arena_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.sim.libero import files, mjcf
-from lerobot_memobench.sim.libero.scene import scene_spec, scene_xml
-from lerobot_memobench.sim.scene import SUBSTEPS
+from lerobot_memobench.sim import files, mjcf
+from lerobot_memobench.sim.robot import SUBSTEPS
+from lerobot_memobench.sim.scene import scene_spec, scene_xml
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import Task

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from mujoco_raster.highlights import HIGHLIGHTS, Highlight
 
@@ -104,7 +103,7 @@ def test_invalid_settings_are_errors(simulate: Simulate) -> None:
 
 _FRAME = """
 import hashlib, os, sys
-from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 

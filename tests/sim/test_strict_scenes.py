@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.libero.scene import get_scene
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.progress import AS_BEGUN

@@ -16,9 +16,9 @@ from PIL import Image
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero import files, mjcf
-from lerobot_memobench.sim.libero.looks import drawing_model
-from lerobot_memobench.sim.libero.scene import get_scene
+from lerobot_memobench.sim import files, mjcf
+from lerobot_memobench.sim.scene import get_scene
+from lerobot_memobench.sim.visuals import drawing_model
 from lerobot_memobench.tasks.catalogue import load_task
 
 PAGE = Path(__file__).parents[2] / "docs/develop/add_an_object_class.md"

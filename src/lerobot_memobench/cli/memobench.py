@@ -186,13 +186,12 @@ def assets(
     """Find LIBERO's assets, of which the scenes are made. They are downloaded from the Hugging Face hub if this machine
     has no complete copy.
     """
-    from lerobot_memobench.sim.libero import fetch
-    from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, TERMS
+    from lerobot_memobench.sim.files import ASSETS_VARIABLE, TERMS, copy_to, obtain
 
-    place = fetch.obtain()
+    place = obtain()
     say(f"LIBERO's assets: {place.folder}, from {place.source}. {TERMS}.")
     if to is not None:
-        say(f"copied {in_words(fetch.copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
+        say(f"copied {in_words(copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
 
 
 # --- train ---

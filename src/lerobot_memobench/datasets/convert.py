@@ -72,7 +72,7 @@ from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.libero.files import check_assets
+from lerobot_memobench.sim.files import check_assets
 
 SUFFIXES = (".hdf5", ".h5")
 MACOS_FOLDER = "__MACOSX"

@@ -34,7 +34,7 @@ from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.libero.files import check_assets
+from lerobot_memobench.sim.files import check_assets
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 

@@ -17,7 +17,7 @@ from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
 from lerobot_memobench.sim.convention import UPRIGHT
-from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.task import Task
 
 HOLD_FRAMES = 10

@@ -57,9 +57,8 @@ from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.scene_hash import check_world
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task

@@ -21,11 +21,10 @@ from lerobot_memobench.perception.detector import Detections, Detector, detectio
 from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
 from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.libero.classes import CLASSES
-from lerobot_memobench.sim.libero.placement import sample_orientation
-from lerobot_memobench.sim.libero.scene import UNKNOWN_CLASS
+from lerobot_memobench.sim.classes import CLASSES, UNKNOWN_CLASS
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
-from lerobot_memobench.sim.object_slots import classes, fill_slots, rotation
+from lerobot_memobench.sim.object_slots import classes, fill_slots
+from lerobot_memobench.sim.placement import quaternion_matrix, sample_orientation
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 
 Array = NDArray[np.float64]
@@ -210,6 +209,6 @@ def _classes() -> Tensor:
     rows = []
     for name in classes():
         known = CLASSES.get(name, UNKNOWN_CLASS)
-        placed = rotation(sample_orientation(known.turns, np.random.RandomState(0)))[:, 0]
+        placed = quaternion_matrix(sample_orientation(known.turns, np.random.RandomState(0)))[:, 0]
         rows.append([FACING.get(name, np.arctan2(placed[1], placed[0])), known.round, known.y_up])
     return torch.tensor(rows)

@@ -156,7 +156,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     """
     from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
     from lerobot_memobench.run.settings import policy_of, with_policy
-    from lerobot_memobench.sim.libero.files import check_assets
+    from lerobot_memobench.sim.files import check_assets
 
     if options.resume and asked.output_dir is None:
         raise MemobenchError("resume=true needs the folder of the evaluation to resume: output_dir=<folder>")

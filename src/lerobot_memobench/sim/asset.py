@@ -26,6 +26,7 @@ COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4
 
 ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
 """Yaws of a grasp whose fingers close along x or y of the body [rad]."""
+Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 """wxyz."""
 
@@ -40,54 +41,47 @@ class Grasp:
     ``symmetric``: whether position and axis may be rotated together about the body's z axis by any angle.
     """
 
-    position: tuple[float, float, float]
+    position: Triple
     yaw: float
     width: float
     symmetric: bool = False
 
 
-@dataclass(frozen=True)
-class Handle:
-    """A bar or ridge in the frame of its site: x along it, y into the fixture.
-
-    ``length``: extent along x [m]. ``thickness``: extents along y and z [m]. ``clearance``: free space behind it [m].
-    """
-
-    length: float
-    thickness: tuple[float, float]
-    clearance: float
-
-
 @dataclass(frozen=True, kw_only=True)
-class JointRule:
-    """Thresholds of a joint's predicates.
+class Articulation:
+    """A drawer, door or knob of a fixture, with its handle and the thresholds of its predicates.
 
     Drawers and doors are open for q < ``open_below`` and closed for q > ``closed_above``; knobs are on for
-    q >= ``on_at_least`` and off for q < ``off_below``; inapplicable thresholds are nan. ``closed_q`` and ``open_q``:
-    targets of q (off and on for a knob), m or rad. ``shares_origin``: whether the moving body has the fixture's origin,
-    so that only the handle distinguishes it from other parts.
+    q >= ``on_at_least`` and off for q < ``off_below``; inapplicable thresholds are nan.
+
+    ``joint``: its name, for an instance with the instance's name. ``body``: name of the moving body in its class.
+    ``handle``: centre of the handle in that body's frame, m. ``handle_quaternion``: rotation from the handle's frame (x
+    along it, y into the fixture) to the body's. ``handle_size``: extents along x, y and z, m. ``clearance``: free
+    space behind the handle, m. ``closed_q`` and ``open_q``: targets of q (off and on for a knob), m or rad.
+    ``ranges``: `init` predicate -> range of initial q. ``shares_origin``: whether the moving body has the fixture's
+    origin, so that only the handle distinguishes it from other parts.
     """
 
     kind: Literal["drawer", "door", "knob"]
+    joint: str
+    body: str
+    handle: Triple
+    handle_size: Triple
+    clearance: float
+    handle_quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
     closed_q: float
     open_q: float
+    ranges: Mapping[str, tuple[float, float]]
     open_below: float = nan
     closed_above: float = nan
     on_at_least: float = nan
     off_below: float = nan
     shares_origin: bool = False
 
-
-@dataclass(frozen=True, kw_only=True)
-class Articulation(JointRule):
-    """A joint of a fixture with its handle.
-
-    ``handle_site``: full name of the site at the handle's centre, on the moving body.
-    """
-
-    joint: str
-    handle_site: str
-    handle: Handle
+    @property
+    def handle_site(self) -> str:
+        """Name of the site at the handle's centre."""
+        return f"{self.joint}_handle"
 
 
 @dataclass(frozen=True)
@@ -108,8 +102,8 @@ class Asset:
     name: str
     class_name: str
     kind: Literal["object", "fixture"]
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
+    low: Triple
+    high: Triple
     grasps: tuple[Grasp, ...] = ()
     articulations: Mapping[str, Articulation] = field(default_factory=lambda: MappingProxyType({}))
     regions: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))

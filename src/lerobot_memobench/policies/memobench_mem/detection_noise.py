@@ -14,10 +14,10 @@ from torch import Tensor
 
 from lerobot_memobench.perception.objects import upright
 from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.libero.scene import standing_heights
+from lerobot_memobench.sim.classes import AGENTVIEW_POSITION
 from lerobot_memobench.sim.object_layout import WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
-from lerobot_memobench.sim.scene import AGENTVIEW_POSITION
+from lerobot_memobench.sim.scene import standing_heights
 
 PLACE, KIND_PLACE = (0.0006, 1.45), (0.00065, 1.0)
 """Error of a place in each direction, m, and the standard deviation of the logarithm of its size: per thing, and shared

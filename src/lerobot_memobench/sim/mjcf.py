@@ -19,10 +19,9 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_name, refusing
+from lerobot_memobench.sim import files
 from lerobot_memobench.sim.asset import TABLE, split_class
-from lerobot_memobench.sim.libero import files
-from lerobot_memobench.sim.libero.arenas import ARENAS
-from lerobot_memobench.sim.libero.classes import ALL_CLASSES, CLASSES, QUARTER, Turn
+from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, QUARTER, Turn
 from lerobot_memobench.tasks.task import STRICT
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
@@ -78,7 +77,8 @@ def class_file(class_name: str, suite: str) -> ClassFile:
     given = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
     if class_name in ALL_CLASSES:
         known = ALL_CLASSES[class_name]
-        return _object_class(files.asset(known.mjcf), known.turns, posixpath.dirname(known.mjcf))
+        mjcf = known.mjcf(class_name)
+        return _object_class(files.asset(mjcf), known.turns, posixpath.dirname(mjcf))
     if file_name(class_name, "the class of an object") in given:
         return _user_class(given[class_name])
     scan = files.scan(class_name) if suite != STRICT else None

@@ -13,7 +13,6 @@ Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come fr
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -21,9 +20,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.asset import Asset
-from lerobot_memobench.sim.libero.arenas import arena_of
-from lerobot_memobench.sim.libero.classes import Turn, parts_of
-from lerobot_memobench.sim.libero.mjcf import ClassFile, class_file
+from lerobot_memobench.sim.classes import Turn, arena_of
+from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
@@ -42,53 +40,36 @@ Pose = NDArray[np.float64]
 """Position and quaternion wxyz, (7,)."""
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Initial poses and joint positions."""
-
-    poses: dict[str, Pose]
-    """World pose of each fixture and object."""
-    joints: dict[str, float]
-    """Position of each articulated joint, m or rad."""
-
-
-def placing_atoms(task: Task, assets: Iterable[str]) -> dict[str, Atom]:
-    """Return the placing `init` atom of each instance, in the order of `init`.
-
-    Raises:
-        MemobenchError: an instance has no placing atom.
-    """
+def _placing_atoms(task: Task, assets: Iterable[str]) -> list[Atom]:
+    """Return the placing `init` atom of each instance, in the order of `init`."""
     places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
     missing = [name for name in assets if name not in places]
     if missing:
         raise MemobenchError(
             f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
         )
-    return places
+    return list(places.values())
 
 
 class Placer:
-    """Place fixtures and objects of one simulation.
+    """Place fixtures and objects of one simulation by the `init` atoms of its task.
 
-    Args:
-        task: task whose `init` atoms define the placement.
-        model: model of the simulation; the poses of fixtures are changed.
-        data: state that is written.
-        assets: kind and class by instance.
+    Raises:
+        MemobenchError: an instance has no placing atom.
     """
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
         self._arena = arena_of(task)
-        self._places = list(placing_atoms(task, assets).values())
+        self._places = _placing_atoms(task, assets)
         self._files = {name: class_file(asset.class_name, task.suite) for name, asset in assets.items()}
 
-    def place(self, seed: int, draw: int = 0) -> Placement:
-        """Sample a placement of a seed, write it into model and data, and return it.
+    def place(self, seed: int, draw: int = 0) -> None:
+        """Sample a placement of a seed and write it into model (fixtures) and data (objects, joints).
 
         Args:
             seed: seed of the scene.
-            draw: number of the placement; only 0 is LIBERO's.
+            draw: number of the scene; only 0 is LIBERO's.
 
         Raises:
             MemobenchError: a region has no free space for its object.
@@ -97,25 +78,40 @@ class Placer:
         rng = np.random.RandomState([seed, draw] if draw else seed)
         rng.randn(7)
         joints = self._draw_joints(rng)
-        self._centre_fixtures(joints)
+        # LIBERO reads the positions of regions while fixtures are at the origin.
+        still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        self._write({name: still for name, asset in self._assets.items() if asset.kind == "fixture"}, joints)
         poses: dict[str, Pose] = {}
         for atom in self._in_order():
             poses[atom.args[0]] = self._draw(atom, poses, rng)
-        placement = Placement(poses, joints)
-        write(placement, self._model, self._data, self._assets)
-        return placement
+        self._write(poses, joints)
+
+    def _write(self, poses: Mapping[str, Pose], joints: Mapping[str, float]) -> None:
+        """Write poses of fixtures and objects, and positions of joints; keep velocities."""
+        model, data = self._model, self._data
+        for name, pose in poses.items():
+            if self._assets[name].kind == "fixture":
+                body = model.body(name).id
+                model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
+            else:
+                address = int(model.joint(f"{name}_joint0").qposadr[0])
+                data.qpos[address : address + 7] = pose
+        for joint, q in joints.items():
+            data.qpos[int(model.joint(joint).qposadr[0])] = q
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
 
     def _in_order(self) -> list[Atom]:
         """Return the placing atoms in LIBERO's order: on the table, on fixtures, in regions, on objects."""
 
-        def turn(atom: Atom) -> int:
+        def rank(atom: Atom) -> int:
             if atom.args[1] in self._assets:
                 return 3
             if atom.predicate == "in":
                 return 2
             return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
 
-        return sorted(self._places, key=turn)
+        return sorted(self._places, key=rank)
 
     # --- joints ---
 
@@ -125,28 +121,22 @@ class Placer:
         for _ in range(MODEL_LOADS):
             for atom in self._task.init:
                 if len(atom.args) == 1:
-                    named = self._parts(atom)
-                    low, high = next(iter(named.values()))
-                    joints.update(dict.fromkeys(named, rng.uniform(low, high)))
+                    ranges = self._joint_ranges(atom)
+                    low, high = next(iter(ranges.values()))
+                    joints.update(dict.fromkeys(ranges, rng.uniform(low, high)))
         return joints
 
-    def _parts(self, atom: Atom) -> dict[str, tuple[float, float]]:
+    def _joint_ranges(self, atom: Atom) -> dict[str, tuple[float, float]]:
         """Return joint -> range of an atom's predicate, for all parts of a fixture or the part of a region."""
         found = {
-            f"{instance}_{part.joint}": part.ranges[atom.predicate]
+            part.joint: part.ranges[atom.predicate]
             for instance, asset in self._assets.items()
-            for region, part in parts_of(asset.class_name)
+            for region, part in asset.articulations.items()
             if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
         }
         if not found:
             raise MemobenchError(f"task {self._task.name}: {atom} of :init applies to no joint")
         return found
-
-    def _centre_fixtures(self, joints: dict[str, float]) -> None:
-        """Move fixtures to the origin, where LIBERO reads the positions of their regions."""
-        still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-        fixtures = {name: still for name, asset in self._assets.items() if asset.kind == "fixture"}
-        write(Placement(fixtures, joints), self._model, self._data, self._assets)
 
     # --- places ---
 
@@ -163,7 +153,7 @@ class Placer:
         for _ in range(MAX_DRAWS):
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             place = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
-            if all(is_clear_of(known, place, self._files[other], others[other]) for other in others):
+            if all(_is_clear_of(known, place, self._files[other], others[other]) for other in others):
                 return np.array([*place, *self._turn(name, where, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "
@@ -192,7 +182,7 @@ class Placer:
             ranges = [(x1 + r, y1 + r, x2 - r, y2 - r) for x1, y1, x2, y2 in region.ranges]
             return ranges, np.array([x, y, z + OBJECT_DROP_HEIGHT])
         site, owner = self._model.site(where).id, poses[region.target]
-        base = owner[:3] + single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
+        base = owner[:3] + _single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
         if atom.predicate == "in":
             return [CENTRE_ONLY], base
         x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
@@ -202,35 +192,20 @@ class Placer:
         """Draw the quaternion wxyz (4,) of an object or fixture."""
         if self._assets[name].kind == "fixture":
             low, high = sorted(self._task.regions[where].yaw)
-            return quaternion("z", rng.uniform(low, high))
+            return _quaternion("z", rng.uniform(low, high))
         return sample_orientation(self._files[name].turns, rng)
 
 
-def is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
+def _is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
     """Return whether an object's disc is clear of another's, or far enough above it."""
     distance = np.hypot(place[0] - pose[0], place[1] - pose[1])
     return bool(distance > other.radius + thing.radius or place[2] - pose[2] > other.top - thing.bottom)
 
 
-def write(placement: Placement, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]) -> None:
-    """Write a placement into a model (fixtures) and data (objects, joints); keep velocities."""
-    for name, pose in placement.poses.items():
-        body = model.body(name)
-        if assets[name].kind == "fixture":
-            model.body_pos[body.id], model.body_quat[body.id] = pose[:3], pose[3:]
-        else:
-            address = int(model.joint(f"{name}_joint0").qposadr[0])
-            data.qpos[address : address + 7] = pose
-    for joint, q in placement.joints.items():
-        data.qpos[int(model.joint(joint).qposadr[0])] = q
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-
-
 # --- turns ---
 
 
-def quaternion(axis: str, angle: float) -> Array:
+def _quaternion(axis: str, angle: float) -> Array:
     """Return the quaternion wxyz (4,) of a rotation about x, y or z, rad."""
     q = np.zeros(4)
     q[0], q[1 + "xyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
@@ -243,7 +218,7 @@ def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> A
     LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
     about z. Several rotations are multiplied in single precision.
     """
-    drawn = [np.roll(quaternion(axis, rng.uniform(low, high)), -1) for axis, low, high in turns]
+    drawn = [np.roll(_quaternion(axis, rng.uniform(low, high)), -1) for axis, low, high in turns]
     if len(drawn) == 1:
         return drawn[0]
     q = np.array([0.0, 0.0, 0.0, 1.0])
@@ -261,7 +236,14 @@ def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> A
     return q.astype(np.float64)
 
 
-def single_precision_matrix(q: Array) -> NDArray[np.float32]:
+def quaternion_matrix(q: Array) -> Array:
+    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
+    matrix = np.empty(9)
+    mujoco.mju_quat2Mat(matrix, q)
+    return matrix.reshape(3, 3)
+
+
+def _single_precision_matrix(q: Array) -> NDArray[np.float32]:
     """Return the rotation (3, 3) of a quaternion wxyz as robosuite computes it, in single precision."""
     q = np.asarray(q, dtype=np.float32)
     q = q * np.float32(np.sqrt(2.0 / np.dot(q, q)))

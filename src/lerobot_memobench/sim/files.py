@@ -20,7 +20,7 @@ import yaml
 from huggingface_hub import constants
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import cache_folder, file_hash
+from lerobot_memobench.io import cache_folder, disk_refusal, file_hash, write_file
 from lerobot_memobench.sim.asset import split_class
 
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
@@ -30,7 +30,7 @@ SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
 """Environment variable with the authors' folder `new_objects`."""
 OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
 """Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
-OWN_OBJECTS = Path(__file__).parents[1] / "objects"
+OWN_OBJECTS = Path(__file__).with_name("objects")
 """Folder of this package's objects of the scanned classes, in LIBERO's layout."""
 REPOSITORY = "lerobot/libero-assets"
 """Dataset repository of the Hugging Face hub with LIBERO's assets, which LeRobot's extra `libero` downloads."""
@@ -217,3 +217,50 @@ def scan(class_name: str) -> Path | None:
     if not path.is_file():
         raise MemobenchError(f"the scan {path} of class {class_name!r} is missing; download the scans again")
     return path
+
+
+# --- download and copy ---
+
+
+def obtain() -> Place:
+    """Return the place of LIBERO's assets, after downloading them to the hub's cache if no place has all files.
+
+    Raises:
+        MemobenchError: the hub cannot be reached, or has other files.
+    """
+    import httpx
+    from huggingface_hub import snapshot_download
+
+    found = places()
+    if (place := usable(found)) is not None:
+        return place
+    wanted, damaged = [*known_hashes()], any(place.source == HUB_CACHE for place in found)
+    try:
+        snapshot_download(REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
+    except (OSError, httpx.TransportError) as error:
+        if disk_refusal(error):
+            raise
+        problem = f"{REPOSITORY} could not be fetched from the hub ({' '.join(str(error).split())[:300]})"
+        raise MemobenchError(f"{problem}; run: {INSTALL}, or {CARRY}") from None
+    return located()
+
+
+def copy_to(folder: Path) -> int:
+    """Copy the files that scenes read, and their terms, into a folder; return their size, bytes.
+
+    Files with the right content stay, so the same call continues an interrupted one.
+
+    Raises:
+        MemobenchError: the folder has another file of a name, or no place has all files.
+    """
+    source, size = check_assets(), 0
+    for name, known in known_hashes().items():
+        target = folder / name
+        if not target.exists():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_file(target, (source / name).read_bytes())
+        if not target.is_file() or file_hash(target) != known:
+            raise MemobenchError(f"{target} exists with other content; name another folder")
+        size += target.stat().st_size
+    write_file(folder / "TERMS.txt", f"{TERMS}.\n")
+    return size
