@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.io import files_below, spelled
+from lerobot_memobench.io import files_below, refusing, spelled
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
 from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
 from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_id, libero_suite_of, libero_tasks
-from lerobot_memobench.tasks.metadata import Metadata, read_text
+from lerobot_memobench.tasks.metadata import Metadata
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
     LIBERO_SUITES,
@@ -335,12 +335,14 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
     bddl, path = spelled(folder / BDDL_FILE), spelled(folder / METADATA_FILE)
-    text = read_text(bddl, "the scene, instruction and goal in BDDL")
+    expected = "expected the scene, instruction and goal in BDDL"
+    with refusing(lambda why: MemobenchError(f"{bddl} cannot be read ({why}), {expected}"), bddl):
+        text = bddl.read_text(encoding="utf-8-sig")
     problem = parse_bddl(text, bddl)
-    metadata = Metadata(path, problem, present=require_metadata or path.exists())
+    metadata = Metadata(path if require_metadata or path.exists() else None, problem)
     data, checkpoints = metadata.data, metadata.checkpoints()
     memory_type = data.get("memory_type") or _infer_memory_type(folder, problem)
-    prompt = metadata.prompt(data["prompt"], "prompt") if "prompt" in data else None
+    inferred = "prompt" not in data
     return Task(
         name=folder.name,
         memory_type=memory_type,
@@ -348,7 +350,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         language=problem.language,
         **problem.scene,
         checkpoints=checkpoints,
-        prompt=prompt if "prompt" in data else _infer_prompt(memory_type, problem, checkpoints),
+        prompt=_infer_prompt(memory_type, problem, checkpoints) if inferred else metadata.prompt(data["prompt"]),
         variants=metadata.variants(),
         demo_summary=data.get("demo_summary", ""),
         folder=folder,
