@@ -242,7 +242,10 @@ def acted(name: str, asked: int, answered: int, horizon: int = HORIZON) -> dict[
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(n, marks=[] if n == ASSEMBLY else pytest.mark.slow) for n in task_names(["object", "procedural"])],
+    [
+        pytest.param(n, marks=[] if n == ASSEMBLY else pytest.mark.slow)
+        for n in task_names("object") + task_names("procedural")
+    ],
 )
 def test_failure_class_of_a_wrong_answer_and_of_a_short_horizon(name: str) -> None:
     first, second, *_ = get_task(name).random_variants

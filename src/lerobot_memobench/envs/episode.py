@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +40,6 @@ from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -88,7 +87,7 @@ class Episode:
     ) -> None:
         self.settings = settings = settings.changed(**changes)
         render = render or RenderSettings(settings.observation_height, settings.observation_width, settings.render)
-        self.published = task = task.at(cast("Difficulty", settings.difficulty))
+        self.published = task = task.at(settings.difficulty)
         self.referent = referent_text(settings.referent, task.drawn)
         self._limit = settings.horizon * steps_per_action(settings.speed)
         self.demonstration_prompt = settings.demonstration_prompt and task.prompt is not None

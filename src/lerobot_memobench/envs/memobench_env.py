@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -52,7 +52,6 @@ from lerobot_memobench.protocol import (
     UNSEEDED,
 )
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
-from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 
@@ -109,7 +108,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             settings = settings.changed(prompt_in=STEPS)
         self.settings = settings
         self.render_mode = render_mode
-        self._task = self._task.at(cast("Difficulty", settings.difficulty))
+        self._task = self._task.at(settings.difficulty)
         self.task = self._task.name
         if settings.needs_prompt and self._task.prompt is None:
             raise MemobenchError(

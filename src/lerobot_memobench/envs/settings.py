@@ -26,10 +26,19 @@ from lerobot_memobench.protocol import (
 )
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
 from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
-from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
 from lerobot_memobench.tasks.evidence import check_referent
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
-from lerobot_memobench.tasks.task import DRAWN, LIBERO_SUITES, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.task import (
+    DIFFICULTIES,
+    DRAWN,
+    LIBERO_SUITES,
+    PUBLISHED,
+    REFERENTS,
+    STANDARD,
+    STRICT,
+    SUITES,
+    horizon_of,
+)
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -331,17 +340,12 @@ class EnvSettings:
             object.__setattr__(self, name, value)
 
     @property
-    def degree(self) -> Degree:
-        """Repetitions and horizon of the difficulty."""
-        return degree_of(self.difficulty)
-
-    @property
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
         limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
         named = self.suite in limits or self.camera_name_mapping is not None
         return {
-            "horizon": limits.get(self.suite, self.degree.horizon),
+            "horizon": limits.get(self.suite, horizon_of(self.difficulty)),
             "convention": MIRRORED if named else UPRIGHT,  # as in LeRobot's environment `libero`
         }
 

@@ -15,9 +15,19 @@ from annotated_types import Ge, Le, Len, MinLen
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import read_json, short
 from lerobot_memobench.tasks.bddl import Problem
-from lerobot_memobench.tasks.difficulty import EASY, Difficulty
 from lerobot_memobench.tasks.formula import Formula, parse_formula, rename
-from lerobot_memobench.tasks.task import OPERATIONS, Checkpoint, MemoryType, Prompt, PromptKind, Suite, Texts, Variant
+from lerobot_memobench.tasks.task import (
+    EASY,
+    OPERATIONS,
+    Checkpoint,
+    Difficulty,
+    MemoryType,
+    Prompt,
+    PromptKind,
+    Suite,
+    Texts,
+    Variant,
+)
 
 LevelTexts = Annotated[list[str], Len(3, 3)]
 LevelLabels = Annotated[list[Annotated[int, Ge(0), Le(2)]], Len(3, 3)]

@@ -9,11 +9,11 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.difficulty import EASY, STANDARD, Difficulty, draws
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
 MemoryType = Literal["temporal", "spatial", "object", "procedural"]
@@ -21,6 +21,7 @@ Operation = Literal["S", "U", "C"]
 PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
 Suite = Literal["published", "strict"]
 LiberoSuite = Literal["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"]
+Difficulty = Literal["easy", "standard", "hard", "extreme"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
@@ -29,6 +30,11 @@ SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
 #: LIBERO's own suites (`tasks.libero_suites`), whose tasks have no checkpoints.
 LIBERO_SUITES: tuple[LiberoSuite, ...] = get_args(LiberoSuite)
+#: Difficulty of strict tasks -> largest number of repetitions that a counting task asks for. Each one draws from the
+#: variants of the easier ones and its own (`Variant.difficulty`).
+REPETITIONS: dict[Difficulty, int] = {"easy": 2, "standard": 3, "hard": 5, "extreme": 8}
+DIFFICULTIES = tuple(REPETITIONS)
+EASY, STANDARD = DIFFICULTIES[:2]
 REFERENTS = ("fixed", "random")
 #: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
 DRAWN = "drawn"
@@ -49,6 +55,15 @@ METADATA_FILE = "task_config.meta.json"
 def referent_text(requested: str, drawn: bool) -> str:
     """Return the effective referent: the requested one, or `DRAWN` for tasks that draw it per episode."""
     return DRAWN if drawn else requested
+
+
+def horizon_of(difficulty: str) -> int:
+    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown.
+
+    As many per repetition as in the standard suite, and not less in all.
+    """
+    check_choice("difficulty", difficulty, DIFFICULTIES)
+    return max(HORIZON, HORIZON * REPETITIONS[cast("Difficulty", difficulty)] // REPETITIONS[STANDARD])
 
 
 @dataclass(frozen=True)
@@ -181,9 +196,9 @@ class Task:
     def __hash__(self) -> int:
         return hash((self.name, self.bddl_text, self.variant_index))
 
-    def at(self, difficulty: Difficulty) -> Task:
+    def at(self, difficulty: str) -> Task:
         """Return the task with the variants of another difficulty (strict tasks only)."""
-        return dataclasses.replace(self, difficulty=difficulty)
+        return dataclasses.replace(self, difficulty=cast("Difficulty", difficulty))
 
     @property
     def title(self) -> str:
@@ -213,9 +228,9 @@ class Task:
     @property
     def random_variants(self) -> tuple[int, ...]:
         """Indices drawn for a random referent: those of the difficulty, without 0 if a stricter variant replaces it."""
-        first = 1 if any(variant.replaces_published for variant in self.variants) else 0
-        harder = {k for k, one in enumerate(self.variants, 1) if not draws(self.difficulty, one.difficulty)}
-        return tuple(k for k in range(first, self.num_variants) if k not in harder)
+        first = () if any(variant.replaces_published for variant in self.variants) else (0,)
+        drawn = DIFFICULTIES[: DIFFICULTIES.index(self.difficulty) + 1]
+        return *first, *(k for k, variant in enumerate(self.variants, 1) if variant.difficulty in drawn)
 
     def variant(self, k: int) -> Task:
         """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is published."""
