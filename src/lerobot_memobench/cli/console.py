@@ -5,24 +5,24 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from enum import StrEnum
 from functools import partial
 from http.client import HTTPException
-from typing import Annotated
+from typing import Annotated, Any, Literal
 from urllib.error import URLError
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+from lerobot_memobench.tasks.task import LiberoSuite, Suite
 
 USAGE_ERROR = 2
 
@@ -36,28 +36,16 @@ WIDTH_OF_A_FILE = 140
 SPEED_PERIOD = 600.0
 
 
-class Suite(StrEnum):
-    """The suite: one set of tasks."""
-
-    PUBLISHED = PUBLISHED
-    STRICT = STRICT
-    LIBERO_SPATIAL = "libero_spatial"
-    LIBERO_OBJECT = "libero_object"
-    LIBERO_GOAL = "libero_goal"
-    LIBERO_10 = "libero_10"
-    LIBERO_90 = "libero_90"
-
-
-WhichSuite = Annotated[
-    Suite,
+AnySuite = Literal[Suite, LiberoSuite]
+SuiteOption = Annotated[
+    AnySuite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
         "picture shows; libero_…: LIBERO's own."
     ),
 ]
-OfSuite = Annotated[
-    Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")
-]
+Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+AsJson = typer.Option("--json", help="Print JSON.")
 
 
 def console() -> Console:
@@ -66,6 +54,14 @@ def console() -> Console:
     It prints brackets as they are, since texts come from files.
     """
     return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False, markup=False)
+
+
+def table(*columns: str, right: Collection[str] = (), **settings: Any) -> Table:
+    """Return a table without rows; columns of numbers are set flush ``right``."""
+    found = Table(header_style="bold", pad_edge=False, title_justify="left", **settings)
+    for name in columns:
+        found.add_column(name, justify="right" if name in right else "left", overflow="fold")
+    return found
 
 
 def say(text: object) -> None:

@@ -19,17 +19,9 @@ if TYPE_CHECKING:
     from lerobot_memobench.evaluation.tables import Report
 
 
-class ReportFormat(StrEnum):
-    """Formats of a report."""
-
-    TABLE = "table"
-    MARKDOWN = "markdown"
-    CSV = "csv"
-    LATEX = "latex"
-    JSON = "json"
-
-
-ENDINGS = {ReportFormat.TABLE: "txt", ReportFormat.MARKDOWN: "md", ReportFormat.LATEX: "tex", ReportFormat.JSON: "json"}
+# an enumeration, because typer takes no list of literals
+ReportFormat = StrEnum("ReportFormat", ["TABLE", "MARKDOWN", "CSV", "LATEX", "JSON"])
+ENDINGS = {"table": "txt", "markdown": "md", "latex": "tex", "json": "json"}
 
 Formats = Annotated[
     list[ReportFormat] | None,
@@ -154,27 +146,20 @@ def rerun(
 
 
 def show_report(
-    report: Report, name: str, formats: Sequence[ReportFormat] | None, out: Path | None, as_csv: str | None = None
+    report: Report, name: str, formats: Sequence[str] | None, out: Path | None, as_csv: str | None = None
 ) -> None:
-    """Print a report in the formats wanted, or write it to a folder as ``name`` with the formats' endings.
-
-    Args:
-        as_csv: its figures as CSV, one a row, in the place of its tables.
-
-    Raises:
-        MemobenchError: ``out`` is a file.
-    """
+    """Print a report in the formats wanted, or write it to a folder; ``as_csv`` replaces its tables in CSV."""
     from lerobot_memobench.evaluation.tables import WRITERS, csv_tables, terminal
 
     if out is not None:
         if out.exists() and not out.is_dir():
             raise MemobenchError(f"--out {out} is a file; name a folder")
         out.mkdir(parents=True, exist_ok=True)
-    for each in dict.fromkeys(formats or [ReportFormat.TABLE]):
-        if out is None and each is ReportFormat.TABLE:
+    for each in dict.fromkeys(formats or ["table"]):
+        if out is None and each == "table":
             console().print(terminal(report), crop=False)
             continue
-        if each is not ReportFormat.CSV:
+        if each != "csv":
             texts = {f"{name}.{ENDINGS[each]}": WRITERS[each](report)}
         elif as_csv is None:
             texts = {f"tables/{key}.csv": text for key, text in csv_tables(report).items()}
