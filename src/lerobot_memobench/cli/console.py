@@ -174,28 +174,29 @@ def one_sentence(error: BaseException) -> str | None:
             return _line(found)
     from draccus.utils import ParsingError
 
-    if isinstance(errors[0], ParsingError):
+    if isinstance(error, ParsingError):
         # draccus hides the message of a configuration's own check behind "couldn't instantiate".
-        return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), errors[0]))
-    if isinstance(errors[0], ImportError) and "required but not installed" in str(errors[0]):
-        return _line(errors[0])  # LeRobot's own words for a missing extra
-    if isinstance(errors[0], FileExistsError):
-        return _line(errors[0])
+        return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), error))
+    extra = isinstance(error, ImportError) and "required but not installed" in str(error)  # of LeRobot
+    if extra or isinstance(error, FileExistsError):
+        return _line(error)
     if refusal := lock_refusal(error):
         return refusal
-    refusal = disk_refusal(error)
-    if refusal is not None:
+    if refusal := disk_refusal(error):
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
         where = f"{os.fsdecode(named)} " if isinstance(named, str | bytes) else ""
         return f"{where}cannot be written ({refusal}): make room, or name another folder"
     fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
     if fetched is not None and came_through(fetched, "torch.hub"):
         return (
-            "the pretrained weights of a backbone are not on this machine and could not be fetched "
-            f"({_line(fetched)[:200]}); "
-            f"{BACKBONE}=null begins with random ones; a checkpoint replaces them in either case"
+            f"the pretrained weights of a backbone are not on this machine and could not be fetched "
+            f"({_line(fetched)[:200]}); {BACKBONE}=null begins with random ones, which a checkpoint replaces"
         )
-    hub = next((found for found in errors if _is_hub_error(found)), None)
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+
+    of_hub = (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.TransportError)
+    hub = next((found for found in errors if isinstance(found, of_hub)), None)
     if hub is None:
         return None
     reason = f"{_address(errors)}{_line(hub)[:200]}"
@@ -208,15 +209,6 @@ def one_sentence(error: BaseException) -> str | None:
     return (
         f"a repository is not on this machine and could not be fetched from the hub ({reason}); name a folder on this "
         "machine: dataset=<folder> or policy=<folder>"
-    )
-
-
-def _is_hub_error(error: BaseException) -> bool:
-    import httpx
-    from huggingface_hub import errors as hub
-
-    return isinstance(
-        error, hub.HfHubHTTPError | hub.LocalEntryNotFoundError | hub.OfflineModeIsEnabled | httpx.TransportError
     )
 
 
