@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import Pacing
-from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
+from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
 from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
@@ -105,7 +105,7 @@ class Episode:
         Args:
             seed: seed of the scene.
             variant: variant to run instead of the drawn one (evidence); `choice` then follows the policy's choice.
-            keep_prompt: whether the prompt is cached (`prompt_cache`).
+            keep_prompt: whether the prompt is cached (`prompts`).
         """
         self.seed = int(seed)
         self.fault: Fault | None = None
@@ -135,7 +135,7 @@ class Episode:
         self._wrong_atoms: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
-        self._prompt: Prompt | None = None
+        self._prompt: PromptPlayer | None = None
         self._reshows = self.settings.reshow
         self.corrupts = self.corrupted = False
         self.waits, self._interrupts = False, self.settings.interference > 0
@@ -166,11 +166,11 @@ class Episode:
             drawn[0] = rng.uniform(0, LONGEST_HOLD)
         return iter(np.ceil(np.minimum(drawn, LONGEST_HOLD)).astype(int).tolist())
 
-    def _new_prompt(self) -> Prompt:
+    def _new_prompt(self) -> PromptPlayer:
         """Return the prompt from its beginning; the scene has to be in its initial state."""
         longest = PROMPT_HORIZON if self.task.prompt_steps is None else self.task.prompt_steps
         file = prompt_file(self.task, self.seed, self.scene_hash) if self._keeps_prompt else None
-        return prompt_of(PromptDemonstrator(self.task, self.sim, self._rng(2)), self.sim, longest, file)
+        return prompt_player(PromptDemonstrator(self.task, self.sim, self._rng(2)), self.sim, longest, file)
 
     def _hide_objects(self) -> None:
         """Play a hiding prompt before the first frame, so that the objects are hidden although it is not shown."""
@@ -191,7 +191,7 @@ class Episode:
         if self._prompt is not None and self._prompt.over:
             self._end_prompt(self._prompt)
 
-    def _end_prompt(self, prompt: Prompt) -> None:
+    def _end_prompt(self, prompt: PromptPlayer) -> None:
         """Restore the initial scene, except for hidden objects."""
         self.prompt_shown = prompt.succeeded
         if self._reshows:
