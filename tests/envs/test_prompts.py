@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs import prompts
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.prompts import PromptPlayer, RestoredPrompt, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET, STEPS
 from lerobot_memobench.errors import MemobenchError

@@ -206,7 +206,7 @@ class Episode:
         self.waits = self._interrupts
 
     def wait(self, last: bool = False) -> None:
-        """Advance the clock while another episode is shown (`interference`); ``last``: no other follows."""
+        """Advance the clock while another episode is shown (`env.Interference`); ``last``: no other follows."""
         self.step_index += 1
         self._execution_step += 1
         self.waits = not last

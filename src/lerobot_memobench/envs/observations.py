@@ -42,7 +42,7 @@ ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
-"""Values of ``reward``; see `memobench_env.MemobenchEnv`."""
+"""Values of ``reward``; see `env.MemobenchEnv`."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 

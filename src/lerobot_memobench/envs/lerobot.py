@@ -273,7 +273,7 @@ class MemobenchEnvConfig(_WithSettings):
         Raises:
             MemobenchError: the folder contains a log of another protocol.
         """
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
+        from lerobot_memobench.envs.env import MemobenchEnv, SkipLogged
 
         settings = self.settings_for(policy)
         check_protocol(log_dir, settings.protocol_block | by.protocol)  # fail before the first episode
@@ -335,7 +335,7 @@ def _vector(
 
     if use_async_envs:
         # Workers are forked from a server, which imports torch and the simulator once.
-        get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.memobench_env"])
+        get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.env"])
         space = observation_space(settings, longest(settings))
         return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
     # LeRobot freezes finished rows of async environments only; a sync row would start another episode.

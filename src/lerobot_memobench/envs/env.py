@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
     OMITTED,
     UNKNOWN_POLICY,
@@ -27,7 +27,6 @@ from lerobot_memobench.envs.episode_log import (
     read_log,
 )
 from lerobot_memobench.envs.evaluation_file import write_protocol
-from lerobot_memobench.envs.interference import Interference
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -51,9 +50,10 @@ from lerobot_memobench.protocol import (
     SPLITS,
     UNSEEDED,
 )
-from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
+from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of, task_names
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
+from lerobot_memobench.tasks.task import Task
 
 logger = logging.getLogger(__name__)
 
@@ -150,7 +150,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _shown(self) -> Episode:
-        """The episode that is observed: the running one, or another one (`interference`)."""
+        """The episode that is observed: the running one, or another one (`Interference`)."""
         return self.episode if self._others is None or self._others.shown is None else self._others.shown
 
     @property
@@ -381,6 +381,56 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._video is not None:
             self._video.discard()
             self._video = None
+
+
+class Interference:
+    """Episodes of other tasks between prompt and execution, as further frames of the prompt phase.
+
+    They are of the tasks with a prompt that follow the environment's task in its suite. The scripted expert acts in
+    them; the policy observes. Its clock continues and its memory is not reset.
+    """
+
+    def __init__(self, task: Task, settings: EnvSettings) -> None:
+        names = [name for name in task_names(suite=task.suite) if get_task(name).prompt is not None]
+        first = names.index(task.name) + 1 if task.name in names else 0
+        order = [name for name in (*names[first:], *names[:first]) if name != task.name]
+        self._task = task
+        self._names = [order[k % len(order)] for k in range(settings.interference)]
+        self._settings = settings.changed(interference=0, evidence=False, pause_steps=0, speed=1.0)
+        self._episodes: dict[str, Episode] = {}  # compiled scenes
+        self.shown: Episode | None = None
+
+    def begin(self, seed: int) -> None:
+        """Draw the scenes of an episode, outside all splits."""
+        self._seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
+        self._done = 0
+        self.shown = None
+
+    def step(self, main: Episode) -> bool:
+        """Advance the shown episode by one control step; False if ``main`` itself has to advance."""
+        if not main.waits:
+            return False
+        if self.shown is None:
+            self._open()
+        elif self.shown.done or self.shown.expert_done:
+            self._done += 1
+            if self._done == len(self._names):
+                self.shown = None
+                main.wait(last=True)
+                return True
+            self._open()
+        else:
+            other = self.shown
+            other.step(np.zeros(ACTION_DIM, np.float32) if other.phase == PROMPT else other.expert_action())
+        main.wait()
+        return True
+
+    def _open(self) -> None:
+        name = self._names[self._done]
+        if name not in self._episodes:
+            self._episodes[name] = Episode(get_task(name), self._settings)
+        self.shown = self._episodes[name]
+        self.shown.reset(int(self._seeds[self._done]))
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
