@@ -125,17 +125,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.action_space = action_space()
         self._acting = acting
         self._log_dir = Path(log_dir) if log_dir is not None else None
-        self._log = self._opened_log(log_dir) if log_dir is not None else None
+        self._log: EpisodeLog | None = None
+        if log_dir is not None:
+            protocol = settings.protocol_block | acting.protocol
+            self._log = EpisodeLog(log_dir, partial(write_protocol, Path(log_dir), protocol))
         self._video: VideoRecorder | None = None
         self._observer = Observer(settings)
         self._others: Interference | None = None
         self._began = self._closed = False
         self._not_run: str | None = None
         self._warned: set[str] = set()
-
-    def _opened_log(self, folder: str) -> EpisodeLog:
-        protocol = self.settings.protocol_block | self._acting.protocol
-        return EpisodeLog(folder, partial(write_protocol, Path(folder), protocol))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state of a copy: everything except the running episode, with its scene and generators."""
@@ -243,15 +242,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if episode.done:
             self._end()
         ended = episode.success or episode.lost or episode.checkpoints_satisfied
-        reward = self._rewarded(episode.progress.index - completed)
+        reward = float(episode.success)
+        if self._reward != SPARSE:
+            reward = (episode.progress.index - completed + reward) / (len(episode.task.checkpoints) + 1)
         return self._observation(), reward, ended, episode.done and not ended, self._info()
-
-    def _rewarded(self, completed: int) -> float:
-        """Return the reward of a step that completed ``completed`` memory checkpoints."""
-        success = self.episode.success
-        if self._reward == SPARSE:
-            return float(success)
-        return (completed + success) / (len(self.episode.task.checkpoints) + 1)
 
     def _observe(self) -> None:
         """Observe the current frame and add it to the video, which skips pauses."""
@@ -276,20 +270,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._warn(self._not_run)
 
     def _warn(self, why: str) -> None:
-        """Log the reason that ended an episode, once per reason."""
         if why not in self._warned:
             self._warned.add(why)
             logger.warning("%s, episode %d: %s", self.task, self._number, why)
 
     def _check_began(self, call: str) -> None:
-        """Raise gymnasium's error for a call without a running episode."""
         if self._closed:
             raise ClosedEnvironmentError(f"Trying to call `{call}` on a closed environment; `reset` opens it again")
         if not self._began:
             raise ResetNeeded(f"Cannot call env.{call}() before calling env.reset()")
 
     def _end(self) -> None:
-        """Finish video and log line of an ended episode, once."""
         if self._over:
             return
         self._over = True
@@ -442,7 +433,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     Args:
         make: makes a `MemobenchEnv`.
         log_dir: folder of the log, read once, at the first reset.
-        settings: settings of the environment.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
@@ -452,7 +442,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         self._skipped: dict[str, Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed, or skip it if it is logged."""
+        """Start the episode of a seed, or skip it."""
         self._skipped = None if seed is None else self._records().get(seed - self._settings.seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
@@ -486,7 +476,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _black(settings: EnvSettings) -> NDArray[np.uint8]:
-    """Return the rendered frame of an episode that is not run."""
     return np.zeros((BAND + settings.observation_height, 2 * settings.observation_width, 3), np.uint8)
 
 

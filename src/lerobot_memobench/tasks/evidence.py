@@ -10,29 +10,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.formula import Atom, Formula, atoms
 from lerobot_memobench.tasks.progress import Evaluator
-from lerobot_memobench.tasks.task import REFERENTS, Task
+from lerobot_memobench.tasks.task import Task
 
 
 def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
     """Return scene index (from 0) and variant of an episode; consecutive episodes cycle through a scene's variants."""
     choices = task.random_variants
     return episode // len(choices), choices[episode % len(choices)]
-
-
-def check_referent(referent: str) -> None:
-    """Check that evidence episodes may use all variants.
-
-    Raises:
-        MemobenchError: ``referent`` allows the published variant only.
-    """
-    if referent == REFERENTS[0]:
-        raise MemobenchError(
-            f"evidence=true runs each scene with each variant, but referent={referent} allows the published variant "
-            f"only; set referent={REFERENTS[1]}"
-        )
 
 
 def chance(task: Task) -> float | None:
