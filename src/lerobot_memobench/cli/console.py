@@ -74,6 +74,20 @@ def note(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def as_path(word: str) -> str:
+    """Return a word of a command line with a path that every library recognises.
+
+    A leading ``~/`` is expanded, which shells do not do in quotes or, some of them, after ``key=``. An existing path
+    with a colon becomes absolute, because Arrow and FFmpeg read ``run: 2`` as an address.
+    """
+    start, path = word.split("=", 1) if "=" in word else ("", word)
+    if path.startswith("~/"):
+        path = os.path.expanduser(path)
+    elif ":" in path and os.path.exists(path):
+        path = os.path.abspath(path)
+    return f"{start}={path}" if "=" in word else path
+
+
 class Count:
     """Progress of a run: a bar on a terminal, a line for each piece of work in a file, both with the time left."""
 

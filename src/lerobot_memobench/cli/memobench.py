@@ -19,12 +19,12 @@ import typer
 from rich.text import Text
 
 from lerobot_memobench.cli import data
-from lerobot_memobench.cli.console import AsJson, SuiteOption, console, note, run_app, say, table
+from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console, note, run_app, say, table
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, export, merge, report, rerun, submit
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
-from lerobot_memobench.io import as_path, count_of, in_words
+from lerobot_memobench.io import count_of, in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.tasks.catalogue import (

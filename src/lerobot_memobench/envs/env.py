@@ -79,12 +79,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     Args:
         task: name in the catalogue of either suite, or a task folder.
-        settings: settings of the environment; ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
+        settings: ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
         log_dir: folder of the episode log; None for no log.
         acting: description of the policy; episodes of other seeds than the requested ones are not logged or recorded.
         reward: `sparse`: 1 at success. `checkpoints`: 1 / (K + 1) for each of the K memory checkpoints completed in
             order, and 1 / (K + 1) at success, so the sum is at most 1 and reaches 1 only with success.
-        render_mode: ``rgb_array``.
         changes: settings by name that replace those of ``settings``, such as ``obs_type``.
     """
 
@@ -335,7 +334,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return observation
 
     def _offered(self, action: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return an offered action, zeros if the expert cannot do the task."""
+        """Return the action, zeros if the expert cannot do the task."""
         offered: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         with self._ending_episode():
             offered = action()

@@ -84,7 +84,6 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
 def _band(
     width: int, language: str, operations: tuple[str, ...], done: int, now: str, prompt: bool
 ) -> NDArray[np.uint8]:
-    """Return the text without the clock, (BAND, width, 3)."""
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     text, font = _fit(draw, language, 14, width - CLOCK)
@@ -100,14 +99,12 @@ def _band(
 
 @lru_cache(maxsize=64)
 def _piece(text: str, prompt: bool) -> NDArray[np.uint8]:
-    """Return the clock's word or a digit, (height, width, 3)."""
     piece = Image.new("RGB", (round(_font(13).getlength(text)), CLOCK_BOTTOM), _BACKGROUND)
     ImageDraw.Draw(piece).text((0, 5), text, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13))
     return np.asarray(piece)
 
 
 def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:
-    """Draw a box at ``x`` pixels with a tick, or with the letter of the memory operation."""
     colour = OPERATION_COLOURS[operation]
     box = (x, 34, x + 20, 54)
     draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
@@ -123,8 +120,7 @@ LAST_FRAMES = 20
 """Repetitions of the final frame: one second."""
 AHEAD = 2
 """Maximum number of frames that wait for the encoder; adding another one blocks."""
-FORMAT = "yuv420p"
-"""Pixel format of the file."""
+PIXEL_FORMAT = "yuv420p"
 
 
 class _DiscardedError(Exception):
@@ -142,9 +138,6 @@ class VideoRecorder:
 
     A thread opens, encodes and writes in the order of the calls; PyAV and x264 release the GIL. `add` and `finish`
     raise a `MemobenchError` if the video cannot be written; call `discard` then.
-
-    Args:
-        path: the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -189,7 +182,6 @@ class VideoRecorder:
             raise _DiscardedError
 
     def _later(self, work: Callable[[VideoFrame], None], picture: VideoFrame) -> None:
-        """Submit work on a picture to the thread."""
         self._waiting.append(_encoder(os.getpid()).submit(self._do, work, picture))
 
     def _next(self) -> VideoFrame:
@@ -217,7 +209,6 @@ class VideoRecorder:
         return picture
 
     def _encode(self, picture: VideoFrame) -> None:
-        """Append a picture; the encoder converts and copies it."""
         if self._container is None:
             self._open(picture)
         self._container.mux(self._stream.encode(picture))
@@ -231,11 +222,10 @@ class VideoRecorder:
         options = {"preset": "ultrafast", "crf": "20", "threads": "1"}
         self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ, options=options)
         self._stream.height, self._stream.width = picture.height, picture.width
-        self._stream.pix_fmt = FORMAT
+        self._stream.pix_fmt = PIXEL_FORMAT
 
     def _end(self, picture: VideoFrame) -> None:
-        """Repeat the last picture and complete the file."""
-        last = picture.reformat(format=FORMAT)
+        last = picture.reformat(format=PIXEL_FORMAT)
         for _ in range(LAST_FRAMES):
             last.pts = None  # the encoder numbers it
             self._encode(last)
