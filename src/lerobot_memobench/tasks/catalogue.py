@@ -204,9 +204,7 @@ def _numbered(word: str, names: list[str], suite: str, listing: str) -> list[str
 def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> tuple[tuple[str, ...], str]:
     """Return suites and ``tasks`` for LeRobot's settings ``task`` and ``task_ids``, next to ``suite`` and ``tasks``.
 
-    Args:
-        task: suites of LIBERO, separated by commas, or what ``tasks`` accepts.
-        task_ids: LIBERO's ids of tasks, from 0, in each of the suites.
+    ``task`` names suites of LIBERO, separated by commas, or is a value of ``tasks``; ``task_ids`` are LIBERO's, from 0.
 
     Raises:
         MemobenchError: both names of one setting are given, or ids with another suite than LIBERO's.
@@ -264,10 +262,8 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
 
 
 def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
-    grouped: dict[str, list[str]] = {}
-    for instance, class_name in instances.items():
-        grouped.setdefault(class_name, []).append(instance)
-    return grouped
+    classes = dict.fromkeys(instances.values())
+    return {each: [instance for instance, name in instances.items() if name == each] for each in classes}
 
 
 # --- task folders ---
@@ -294,15 +290,11 @@ def find_tasks(folder: str | Path) -> list[Path]:
 
 
 def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
-    """Load a task folder.
+    """Load a task folder; without ``require_metadata`` one without a metadata file is a task without checkpoints.
 
     A memory type missing from the metadata is the parent folder's name if it is one of the four. Otherwise it is
     ``procedural`` or ``object`` for an instruction that mentions a prompt or video (``procedural`` if it also mentions
     a procedure, sequence or steps), ``temporal`` if the goal contains a latch, else ``spatial``.
-
-    Args:
-        folder: task folder.
-        require_metadata: False loads a folder without a metadata file as a task without checkpoints.
 
     Raises:
         MemobenchError: with file, place, the value found and the value expected.

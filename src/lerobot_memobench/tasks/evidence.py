@@ -43,11 +43,8 @@ class Choice:
 
     The sequence of lifted objects and moved joints decides. If it fits the goal of one variant only, that variant is
     chosen; if it fits none, the answer is wrong. If goals handle the same objects in the same order (one object,
-    several places), the first goal to become true is chosen, or the only one that is still reachable.
-
-    Args:
-        task: variant that is run. Candidates are the variants with its instruction, or all variants if the
-            instruction determines the goal (for example a count).
+    several places), the first goal to become true is chosen, or the only one that is still reachable. Candidates are
+    the variants with the instruction of ``task``, or all variants if the instruction determines the goal (a count).
     """
 
     def __init__(self, task: Task) -> None:

@@ -49,11 +49,9 @@ def classify_failure(
 
     Args:
         first_steps: (K,) first execution step at which each checkpoint's predicate held; None for never.
-        success: whether the goal held at the end.
         drift: whether a wrong answer was given (object and procedural tasks).
-        lost: the part of the goal that made it unreachable (strict tasks), see `Progress.broken`.
+        lost, ordered: `Progress.broken` and `Progress.ordered` of strict tasks.
         cut_off: whether a horizon below the protocol's ended the episode.
-        ordered: see `Progress.ordered`.
     """
     if lost and (spoilt := _spoilt(task, first_steps, lost)) is not None:
         return spoilt
@@ -112,18 +110,11 @@ def classify(
 
 
 def asks_order(goal: Formula) -> bool:
-    """Return whether a goal requires an order of its parts."""
+    """Return whether a goal asks for an order of its parts."""
     return any(isinstance(part, Then | When | Round) for part in walk(goal))
 
 
 def _out_of_order(first_steps: Sequence[int | None]) -> bool:
     """Return whether a checkpoint was satisfied before, or without, an earlier one."""
-    earlier_missing, latest = False, 0
-    for step in first_steps:
-        if step is None:
-            earlier_missing = True
-            continue
-        if earlier_missing or step < latest:
-            return True
-        latest = step
-    return False
+    reached = [step for step in first_steps if step is not None]
+    return reached != sorted(reached) or None in first_steps[: len(reached)]

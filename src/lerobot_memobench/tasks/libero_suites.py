@@ -36,11 +36,7 @@ STEP_LIMITS: dict[LiberoSuite, int] = {
 
 
 def libero_tasks(suite: str) -> tuple[str, ...]:
-    """Return the names of a suite's tasks in LIBERO's order: a task's id is its index.
-
-    Raises:
-        MemobenchError: the suite is unknown, or its file is damaged.
-    """
+    """Return the names of a suite's tasks in LIBERO's order, a task's id is its index; raises for an unknown suite."""
     check_choice("suite", suite, LIBERO_SUITES)
     return _names(suite)
 
@@ -55,9 +51,6 @@ def get_libero_task(name: str) -> Task:
     """Return a LIBERO task.
 
     Its instruction is LIBERO's and LeRobot's, derived from the task's name; the file's ``:language`` may differ.
-
-    Raises:
-        MemobenchError: the name is unknown, or the suite's file is damaged.
     """
     suite = _suite_of(name)
     text = _read(suite, f"{name}.bddl").decode()

@@ -21,11 +21,9 @@ AS_BEGUN = Atom("asbegun", ())
 class Evaluator:
     """Evaluate several formulas once per control step and keep their state.
 
-    - ``holds`` is called at most once per distinct atom and step, and never for a latched predicate.
-    - Latches of all formulas are updated first, whether or not their formula evaluates them; ``reset`` clears them.
-    - A child of ``Then`` is done after it has held for ``hold_steps`` consecutive steps. The following child is
-      evaluated from the next step. Done children stay done. ``Then`` is true when its last child is done. A nested
-      ``Then`` must itself be true for ``hold_steps`` steps.
+    Latches of all formulas are updated first, whether or not their formula evaluates them. A child of ``Then`` is done
+    after it has held for ``hold_steps`` consecutive steps, and stays done. The following child is evaluated from the
+    next step. ``Then`` is true when its last child is done; a nested one must itself be true for ``hold_steps`` steps.
     """
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
@@ -65,7 +63,10 @@ class Evaluator:
         return [(part, each.settled) for part, each in zip(children(formula), node.parts, strict=True)]
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
-        """Evaluate one control step and return the value of each formula; ``holds`` evaluates atoms."""
+        """Evaluate one control step and return the value of each formula.
+
+        ``holds`` is called at most once per distinct atom, and never for a latched predicate.
+        """
         memo: dict[Atom, bool] = {}
 
         def world(atom: Atom) -> bool:
@@ -86,9 +87,7 @@ class Evaluator:
 class Progress:
     """Track the execution phase of one episode; call ``step`` exactly once per control step.
 
-    Args:
-        task: task with goal and checkpoints.
-        evaluations: evaluations per control step; with two, each part of `Then` has to hold for five steps.
+    With two ``evaluations`` per control step, each part of `Then` has to hold for five steps.
 
     Attributes (steps count from 1, None before the event; K checkpoints):
         steps: control steps taken since ``reset``.

@@ -68,13 +68,7 @@ def horizon_of(difficulty: str) -> int:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A memory checkpoint.
-
-    Attributes:
-        goal: predicate that detects the event.
-        operations_by_level: labels at the coarse, intermediate and fine level.
-        language: reference memory texts after the event, at the three levels.
-    """
+    """A memory checkpoint: the goal detects the event; labels and texts at the coarse, intermediate and fine level."""
 
     goal: Formula
     operations_by_level: tuple[Operation, Operation, Operation]
@@ -113,11 +107,8 @@ class Variant:
         substitute: simultaneous replacement of names in goal, checkpoint goals and prompt target.
         order: index of the published checkpoint at each position; operation labels keep their positions.
         languages: texts per position (coarse, intermediate, fine).
-        goals: checkpoint goals per position; override substituted and reordered goals.
-        goal: goal; overrides the substituted goal.
-        demo_summary: description of the demonstration.
-        language: instruction; overrides the task's.
-        prompt: demonstration prompt; overrides the substituted prompt.
+        goals, goal: checkpoint goals per position, and goal; override substituted and reordered ones.
+        language, prompt: override the task's instruction and the substituted prompt.
         replaces_published: whether the published goal is looser (accepts another order); then variant 0 is not drawn.
         difficulty: lowest difficulty at which it is drawn.
     """
@@ -139,20 +130,16 @@ class Task:
     """All data of a task. Do not modify its dicts.
 
     Attributes:
-        name: name of the folder.
         memory_type: temporal, spatial, object or procedural; the suite for a task of LIBERO's suites, which LeRobot
             reports by suite.
         family: group of similar tasks.
-        language: instruction.
         objects: instance -> class, in the file's order.
         fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: initial state; objects in regions are sampled, others rest on their support.
-        prompt: demonstration prompt; None for the published temporal and spatial tasks.
+        prompt: None for the published temporal and spatial tasks.
         variants: alternatives to the published task: ``variant(k)`` for k >= 1.
-        variant_index: index of this variant.
-        bddl_text: content of the task file.
-        metadata: content of the metadata file.
+        bddl_text, metadata: content of the task's files.
         suite: published, strict or one of LIBERO's; a strict episode ends when its goal can no longer be reached.
         derived_from: published task with the same scene; None for a task with its own scene.
         drawn: whether each episode draws its variant by seed and ignores the referent setting; False for a variant.
