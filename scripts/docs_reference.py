@@ -56,8 +56,8 @@ PUBLIC = {
     "Tasks": ("tasks.catalogue", "get_task load_task resolve_tasks task_names find_tasks"),
     "Task": ("tasks.task", "Task Checkpoint Prompt Variant"),
     "Formulas": ("tasks.formula", ""),
-    "Environment": ("envs.memobench_env", "MemobenchEnv"),
-    "Environment configuration": ("envs.configuration_memobench", "MemobenchEnvConfig"),
+    "Environment": ("envs.env", "MemobenchEnv"),
+    "Environment configuration": ("envs.lerobot", "MemobenchEnvConfig"),
     "vla-evaluation-harness": ("vla_eval", "MEMOBench"),
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
@@ -144,7 +144,7 @@ def environment_fields() -> Iterator[tuple[str, str, str]]:
         values = ", ".join(code(value) for value in field.metadata["values"] or ())
         default = field.metadata["usual"] or repr(field.default)
         yield field.name, default, f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
-    tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
+    tree = class_of(SOURCE / "envs" / "lerobot.py", "MemobenchEnvConfig")
     meaning = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in meaning:

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lerobot_memobench
+from lerobot_memobench.cli.console import as_path
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
-    as_path,
     disk_refusal,
     draft_of,
     explaining_disk_errors,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from lerobot_memobench.cli.console import Count, Suite, WhichSuite, console, counting
+from lerobot_memobench.cli.console import Count, SuiteOption, console, counting
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.command import run
 
@@ -31,7 +31,7 @@ class WhichReferent(StrEnum):
 
 def necessity(
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
-    suite: WhichSuite = Suite.PUBLISHED,
+    suite: SuiteOption = "published",
     referent: Annotated[
         WhichReferent, typer.Option(help="Goal of object and procedural tasks: fixed, random, or both settings.")
     ] = WhichReferent.BOTH,

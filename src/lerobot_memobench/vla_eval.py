@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.configuration_memobench import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import Acting
 from lerobot_memobench.envs.evaluation_file import check_protocol
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings

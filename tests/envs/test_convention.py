@@ -18,10 +18,10 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 from lerobot.processor.env_processor import LiberoProcessorStep
 
 import lerobot_memobench.envs  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import ROBOT_STATE
 from lerobot_memobench.envs.video import BAND
 from lerobot_memobench.errors import MemobenchError

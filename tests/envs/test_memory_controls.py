@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import differences, read_episodes
 from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT

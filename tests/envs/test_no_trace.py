@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import Hand

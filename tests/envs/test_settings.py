@@ -15,7 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import differences
 from lerobot_memobench.envs.evaluation_file import (
@@ -28,7 +28,7 @@ from lerobot_memobench.envs.evaluation_file import (
     read_evaluation,
     write_protocol,
 )
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON

@@ -20,8 +20,8 @@ from vla_eval.specs import check_specs
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode as episodes
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import report_values, summarise
 from lerobot_memobench.protocol import EXECUTION, NO_CLOCK

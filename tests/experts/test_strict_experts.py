@@ -18,9 +18,8 @@ from lerobot_memobench.experts.travel import Held
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.difficulty import degree_of
 from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import Task, horizon_of
 from tests.experts.test_expert import play
 from tests.support.libero import simulate
 
@@ -215,6 +214,6 @@ def test_visits_home_between_events() -> None:
 @pytest.mark.parametrize("name", task_names(suite="strict"))
 def test_solves_every_variant(name: str) -> None:
     base = get_task(name)
-    horizon = degree_of("extreme").horizon  # the largest counts
+    horizon = horizon_of("extreme")  # the largest counts
     faults = [play(base.variant(k), 20_000 + k, prompt=True, horizon=horizon).faults for k in range(base.num_variants)]
     assert not any(faults)

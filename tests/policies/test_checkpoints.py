@@ -24,7 +24,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.subject import load_subject
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import (

@@ -18,7 +18,7 @@ from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.envs
 import lerobot_memobench.registration  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.convention import chosen_convention
 from lerobot_memobench.run.command_line import parse_words

@@ -22,8 +22,8 @@ from lerobot.utils.constants import OBS_IMAGES
 from vla_eval import serve_background
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import transports as wire
 from lerobot_memobench.policies.remote.configuration_remote import OPENPI_KEYS, RemoteConfig

@@ -11,8 +11,8 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.tasks.libero_suites import libero_tasks

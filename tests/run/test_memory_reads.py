@@ -11,8 +11,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.settings import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html.data import page_data

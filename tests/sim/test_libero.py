@@ -188,7 +188,7 @@ def test_records_made_again(kind: str, tmp_path: Path) -> None:
 RESETS = """
 import numpy as np
 from pathlib import Path
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.tasks.catalogue import task_names
 
 names = task_names()[:14]

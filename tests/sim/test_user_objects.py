@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import files, mjcf
 from lerobot_memobench.sim.scene import get_scene

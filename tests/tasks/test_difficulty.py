@@ -19,8 +19,7 @@ from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Difficulty
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.task import DIFFICULTIES, STANDARD, STRICT, Difficulty
 
 STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 

@@ -20,7 +20,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.datasets.lerobot_format.tables import read_info
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS
 from lerobot_memobench.run.command_line import parse_words, read_words

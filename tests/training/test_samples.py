@@ -18,7 +18,7 @@ from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.training import command, samples
 from lerobot_memobench.training.samples import keep_in_memory, open_datasets
 

@@ -3,51 +3,46 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
-from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
+from lerobot_memobench.cli.console import AnySuite, SuiteOption, Workers, console, counting, say, table
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
-from lerobot_memobench.tasks.task import LIBERO_SUITES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import GenerationSummary
     from lerobot_memobench.datasets.validate import Verdict
     from lerobot_memobench.jobs.processes import Advance
 
 
 Convention = Annotated[str, typer.Option(help="Images upright, or libero: mirrored and named as in LIBERO's data.")]
-
-
-class Referent(StrEnum):
-    """The goals of object and procedural tasks."""
-
-    FIXED = "fixed"
-    RANDOM = "random"
+RepoId = Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")]
+Finished = Annotated[Path, typer.Argument(help="Folder of a finished dataset.")]
+OfSuite = Annotated[
+    AnySuite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")
+]
 
 
 def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
-    suite: WhichSuite = Suite.PUBLISHED,
+    suite: SuiteOption = PUBLISHED,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
     ] = None,
     seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
     referent: Annotated[
-        Referent, typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
-    ] = Referent.FIXED,
+        Literal["fixed", "random"], typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
+    ] = "fixed",
     images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
     image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
     demonstration_prompt: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
@@ -55,8 +50,8 @@ def generate(
         bool, typer.Option("--perturb", help="Disturb the arm at random; actions are the expert's corrections.")
     ] = False,
     convention: Convention = UPRIGHT,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    workers: Workers = 1,
+    repo_id: RepoId = None,
     finish: Annotated[
         bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
     ] = False,
@@ -86,7 +81,7 @@ def generate(
             out,
             prompted_episodes=prompted_episodes,
             seed_base=seed_base,
-            referent=referent.value,
+            referent=referent,
             images=images,
             image_size=image_size,
             demonstration_prompt=demonstration_prompt,
@@ -98,30 +93,16 @@ def generate(
             notify=partial(screen.print, soft_wrap=True),
             **named,
         )
-    _print_summary(summary)
-    return summary.exit_status
-
-
-def _print_summary(summary: GenerationSummary) -> None:
-    """Print the outcome of every seed and the place of the dataset."""
-    console().print(Unbroken(_summary_table(summary)), crop=False)
-    for failure in summary.failures:
-        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
-    if summary.folder is None:
-        say("no dataset was written: no seed was solved")
-    else:
-        say(f"dataset: {summary.folder}")
-
-
-def _summary_table(summary: GenerationSummary) -> Table:
-    table = Table(header_style="bold", pad_edge=False)
-    table.add_column("task")
-    for name in ("solved", "of", "frames", "mean length"):
-        table.add_column(name, justify="right")
+    rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
     for task in summary.tasks:
         mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
-        table.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
-    return table
+        rows.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
+    console().print(Unbroken(rows), crop=False)
+    for failure in summary.failures:
+        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
+    written = f"dataset: {summary.folder}"
+    say("no dataset was written: no seed was solved" if summary.folder is None else written)
+    return summary.exit_status
 
 
 def convert(
@@ -130,8 +111,8 @@ def convert(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     convention: Convention = UPRIGHT,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    workers: Workers = 1,
+    repo_id: RepoId = None,
 ) -> int:
     """Turn HDF5 demonstrations into a LeRobotDataset.
 
@@ -158,10 +139,8 @@ def convert(
         say(f"left out: {problem}")
     for note in summary.notes:
         say(f"note: {note}")
-    if summary.folder is None:
-        say("no dataset was written: no demonstration could be used")
-    else:
-        say(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}")
+    written = f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}"
+    say("no dataset was written: no demonstration could be used" if summary.folder is None else written)
     return summary.exit_status
 
 
@@ -243,8 +222,8 @@ def view(
 
 
 def validate(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    folder: Finished,
+    workers: Workers = 1,
     suite: OfSuite = None,
 ) -> int:
     """Replay every episode and read every file to its end.
@@ -273,7 +252,7 @@ def validate(
 
 
 def push(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    folder: Finished,
     repo_id: Annotated[str, typer.Option(help="Where to, user/name on the Hugging Face hub.")],
     private: Annotated[bool | None, typer.Option(help="Whether a repository that has to be made is private.")] = None,
 ) -> int:
@@ -287,7 +266,7 @@ def push(
 
 
 def describe(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    folder: Finished,
     out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
     suite: OfSuite = None,
 ) -> int:

@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
+from lerobot_memobench.cli.console import WITH_PARENT, as_path, console, counting, note, run_command, say
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import as_path, explaining_disk_errors
+from lerobot_memobench.io import explaining_disk_errors
 from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.run.command_line import (

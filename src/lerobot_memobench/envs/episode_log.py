@@ -37,10 +37,9 @@ from lerobot_memobench.io import (
 )
 from lerobot_memobench.protocol import BY_PAPER
 from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
-from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
+from lerobot_memobench.tasks.task import PUBLISHED, STANDARD, STRICT, Difficulty, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode

@@ -29,13 +29,10 @@ FEWEST_STEPS_AWAY = 2
 class Pacing:
     """Map the policy's actions to the actions that are executed.
 
-    Args:
-        settings: uses ``pause_steps``; ``speed``: at 1/n an action takes n control steps, each with 1/n of its
-            displacement; ``replan_steps``: actions per prediction; ``window_steps``; ``delay_steps``.
-        rng: draws the start of each pause.
+    At a ``speed`` of 1/n an action takes n control steps, each with 1/n of its displacement.
 
     Attributes:
-        pauses: whether the settings contain pauses.
+        pauses: whether the settings contain pauses, whose starts ``rng`` draws.
         paused_steps, held_steps: control steps of pauses and of holds so far.
     """
 
@@ -110,13 +107,11 @@ def longest(settings: EnvSettings) -> int:
 
 
 def paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
-    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses.
-
-    A rollout may end in a pause.
-    """
+    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
     chunk = replan_steps or 1
     pause = _whole_chunks(pause_steps, chunk)
     fewest, most = STEPS_BETWEEN_PAUSES
+    # A rollout may end in a pause.
     return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.observations import RESET
+from lerobot_memobench.envs.settings import RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file
 from lerobot_memobench.tasks.task import PUBLISHED

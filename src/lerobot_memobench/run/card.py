@@ -295,8 +295,8 @@ def first_variant_mismatch(records: Iterable[Mapping[str, Any]]) -> str | None:
     """
     from lerobot_memobench.envs.episode import referent_of
     from lerobot_memobench.tasks.catalogue import get_task, suite_of
-    from lerobot_memobench.tasks.difficulty import STANDARD
     from lerobot_memobench.tasks.evidence import scene_and_variant
+    from lerobot_memobench.tasks.task import STANDARD
 
     for record in records:
         task, variant, seed = record["task"], record.get("variant"), record.get("seed")

@@ -14,8 +14,8 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.lerobot import Opener
 from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.lerobot_config import acting, quiet

@@ -41,7 +41,7 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
-    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.run.settings import EvaluationSettings
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
@@ -154,7 +154,7 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     Raises:
         MemobenchError: it cannot be run.
     """
-    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.run.settings import policy_of, with_policy
     from lerobot_memobench.sim.files import check_assets
 

@@ -47,8 +47,7 @@ from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_p
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.scene_hash import WORLD, check_world
-from lerobot_memobench.tasks.difficulty import STANDARD
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.tasks.task import PUBLISHED, STANDARD
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""

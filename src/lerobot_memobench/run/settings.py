@@ -12,7 +12,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import portable_path

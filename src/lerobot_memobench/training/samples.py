@@ -22,7 +22,7 @@ from lerobot.scripts import lerobot_train
 from torch import Tensor
 
 from lerobot_memobench.datasets.frames import SamplesInMemory
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import lock_refusal
 from lerobot_memobench.run.command_line import register_plugins

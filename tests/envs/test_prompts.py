@@ -14,10 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
-from lerobot_memobench.envs import prompt_cache
+from lerobot_memobench.envs import prompts
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.prompt_cache import Prompt, RestoredPrompt, prompt_file, prompt_of
+from lerobot_memobench.envs.prompts import PromptPlayer, RestoredPrompt, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET, STEPS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import ACTION_DIM
@@ -36,8 +36,8 @@ HORIZON = 3
 @pytest.fixture
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """Turn the cache on; return the folder of its files."""
-    monkeypatch.delenv(prompt_cache.VARIABLE)
-    monkeypatch.setattr(prompt_cache, "cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.delenv(prompts.VARIABLE)
+    monkeypatch.setattr(prompts, "cache_folder", lambda: tmp_path / "cache")
     return tmp_path / "cache" / "prompts"
 
 
@@ -112,7 +112,7 @@ def test_rollouts_are_equal_without_cache_while_writing_and_restored(
     seed = 20_000
     runs, steps = {}, {}
     for run, off in {"simulated": "off", "written": "", "restored": ""}.items():
-        monkeypatch.setenv(prompt_cache.VARIABLE, off)
+        monkeypatch.setenv(prompts.VARIABLE, off)
         simulated[0] = 0
         runs[run] = rollout(name, seed, tmp_path / run, STEPS, obs_type)
         steps[run] = simulated[0]
@@ -159,7 +159,7 @@ def sim() -> Simulation:
 def play(sim: Simulation, file: Path | None, broken: bool = False) -> tuple[type, bytes]:
     """Play a short prompt; return its class and the simulation's state after it."""
     sim.reset(7)
-    prompt = prompt_of(ShortPrompt(broken), sim, 100, file)  # type: ignore[arg-type]
+    prompt = prompt_player(ShortPrompt(broken), sim, 100, file)  # type: ignore[arg-type]
     while not prompt.over:
         prompt.step()
     assert prompt.succeeded
@@ -179,10 +179,10 @@ DAMAGE: dict[str, Callable[[Path], object]] = {
     "cut": lambda file: file.write_bytes(file.read_bytes()[:-200]),
     "one bit": lambda file: file.write_bytes(b"".join([(b := file.read_bytes())[:900], bytes([b[900] ^ 1]), b[901:]])),
     "another prompt": lambda file: resave(file, {"name": np.array("other.npz")}),
-    "another scene": lambda file: resave(file, {"physics": arrays(file)["physics"][:, :-1]}),
-    "single precision": lambda file: resave(file, {"physics": arrays(file)["physics"].astype(np.float32)}),
-    "no step": lambda file: resave(file, {k: v[:0] for k, v in arrays(file).items() if v.ndim}),
-    "pickled": lambda file: resave(file, {"actions": np.array([print], dtype=object)}),
+    "another scene": lambda file: resave(file, {"rows": arrays(file)["rows"][:, :-1]}),
+    "single precision": lambda file: resave(file, {"rows": arrays(file)["rows"].astype(np.float32)}),
+    "no step": lambda file: resave(file, {"rows": arrays(file)["rows"][:0]}),
+    "pickled": lambda file: resave(file, {"rows": np.array([print], dtype=object)}),
 }
 
 
@@ -191,9 +191,9 @@ def test_damaged_file_is_written_again(folder: Path, sim: Simulation, damage: st
     file = folder / "prompt.npz"
     kind, state = play(sim, file)
     before = arrays(file)
-    assert (kind, play(sim, file)) == (Prompt, (RestoredPrompt, state))
+    assert (kind, play(sim, file)) == (PromptPlayer, (RestoredPrompt, state))
     DAMAGE[damage](file)
-    assert play(sim, file) == (Prompt, state)
+    assert play(sim, file) == (PromptPlayer, state)
     assert {k: v.tobytes() for k, v in arrays(file).items()} == {k: v.tobytes() for k, v in before.items()}
 
 
@@ -220,7 +220,7 @@ def test_least_recently_used_files_are_removed(folder: Path, sim: Simulation, mo
     dead.write_bytes(b"0" * files[0].stat().st_size)
     os.utime(dead, (1, 1))
     assert play(sim, files[0])[0] is RestoredPrompt  # now the newest
-    monkeypatch.setattr(prompt_cache, "LARGEST", 3 * files[0].stat().st_size)
+    monkeypatch.setattr(prompts, "LARGEST", 3 * files[0].stat().st_size)
     play(sim, folder / "e.npz")
     assert sorted(file.name for file in folder.iterdir()) == ["a.npz", "c.npz", "e.npz"]
 
@@ -239,11 +239,11 @@ def test_file_name_depends_on_everything_that_affects_the_prompt(folder: Path, m
         file(scene="1"),
         file(dataclasses.replace(task, prompt=prompt)),
     ]
-    monkeypatch.setattr(prompt_cache, "_code", lambda: ("a later MuJoCo",))
+    monkeypatch.setattr(prompts, "_code", lambda: ("a later MuJoCo",))
     assert len({*files, file()}) == 6
     assert file() == file(dataclasses.replace(task, folder=Path("elsewhere")))
     assert {path.parent for path in files if path} == {folder}
-    monkeypatch.setenv(prompt_cache.VARIABLE, "off")
+    monkeypatch.setenv(prompts.VARIABLE, "off")
     assert file() is None
 
 

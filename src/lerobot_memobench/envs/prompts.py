@@ -15,7 +15,6 @@ import sys
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,27 +35,7 @@ PACKAGES = ("mujoco", "numpy", "scipy")
 SOURCES = ("tasks", "sim", "experts", "envs")
 
 
-class Frames(NamedTuple):
-    """The arrays of a file with a prompt of ``n`` control steps.
-
-    Attributes:
-        actions: (n, 7) float32, executed actions.
-        physics: (n, `Simulation.physics_dim`) float64, `Snapshot.physics` after each step.
-        controller: (n, 14) float64, goal position (3), goal rotation (9) and gripper (2) of the snapshot.
-        goes_on: (n,) bool, of the snapshot.
-        highlights: (n, 4) float64, position and radius; NaN without a highlight.
-        shown: () bool, whether the prompt succeeded.
-    """
-
-    actions: NDArray[np.float32]
-    physics: NDArray[np.float64]
-    controller: NDArray[np.float64]
-    goes_on: NDArray[np.bool_]
-    highlights: NDArray[np.float64]
-    shown: NDArray[np.bool_]
-
-
-class Prompt:
+class PromptPlayer:
     """Simulate a prompt step by step.
 
     Args:
@@ -79,7 +58,7 @@ class Prompt:
         self._actions = demonstrator.actions()
         self._next = next(self._actions, None)
         self._steps = 0
-        self._frames: list[tuple[NDArray[np.float32], Snapshot, tuple[Highlight, ...]]] = []
+        self._rows: list[NDArray[np.float64]] = []
 
     def step(self) -> NDArray[np.float32]:
         """Advance by one control step and return the executed action (7,)."""
@@ -94,48 +73,49 @@ class Prompt:
         self.succeeded = self._demonstrator.succeeded
         self._file = file
         if file is not None:
-            self._frames.append((action, self._sim.snapshot(), self._sim.highlights))
+            self._rows.append(_row(action, self._sim))
             if self.over:
-                _write(file, self._as_arrays())
+                _write(file, np.array(self._rows), self.succeeded)
         return action
 
-    def _as_arrays(self) -> Frames:
-        actions, snapshots, lit = zip(*self._frames, strict=True)
-        no_highlight = (np.nan,) * 4
-        return Frames(
-            np.array(actions),
-            np.array([snapshot.physics for snapshot in snapshots]),
-            np.array([[*each.goal_position, *each.goal_rotation.flat, *each.gripper] for each in snapshots]),
-            np.array([snapshot.goes_on for snapshot in snapshots]),
-            np.array([(*found[0].position, found[0].radius) if found else no_highlight for found in lit]),
-            np.array(self.succeeded),
-        )
 
-
-class RestoredPrompt(Prompt):
+class RestoredPrompt(PromptPlayer):
     """Restore a stored prompt step by step."""
 
-    def __init__(self, sim: Simulation, frames: Frames) -> None:
-        self._sim, self._kept, self._steps = sim, frames, 0
+    def __init__(self, sim: Simulation, rows: NDArray[np.float64], succeeded: bool) -> None:
+        self._sim, self._kept, self._steps, self.succeeded = sim, rows, 0, succeeded
 
     def step(self) -> NDArray[np.float32]:
         """Advance by one control step and return the executed action (7,)."""
-        kept, k = self._kept, self._steps
+        parts = np.split(self._kept[self._steps], np.cumsum(_PARTS))
+        action, position, rotation, gripper, goes_on, highlight, physics = parts
         self._steps += 1
-        self.over, self.succeeded = self._steps == len(kept.actions), bool(kept.shown)
+        self.over = self._steps == len(self._kept)
         if self.observed or self.over:
-            position, rotation, gripper = np.split(kept.controller[k], [3, 12])
-            snapshot = Snapshot(kept.physics[k], position, rotation.reshape(3, 3), gripper, bool(kept.goes_on[k]))
+            snapshot = Snapshot(physics, position, rotation.reshape(3, 3), gripper, bool(goes_on[0]))
             self._sim.restore(snapshot, replayed=True)
-            x, y, z, radius = map(float, kept.highlights[k])
+            x, y, z, radius = map(float, highlight)
             self._sim.highlights = () if np.isnan(radius) else (Highlight((x, y, z), radius),)
-        return kept.actions[k].copy()
+        return action.astype(np.float32)
 
 
-def prompt_of(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> Prompt:
-    """Return a prompt that is restored if ``file`` contains it, else simulated. Arguments: see `Prompt`."""
-    frames = None if file is None else _read(file, sim.physics_dim)
-    return Prompt(demonstrator, sim, longest, file) if frames is None else RestoredPrompt(sim, frames)
+_PARTS = (ACTION_DIM, 3, 9, 2, 1, 4)
+"""Numbers in a row: action, the snapshot's goal position and rotation, gripper and ``goes_on``, position and radius of
+the highlight (NaN without one). The physics of the snapshot follow."""
+
+
+def _row(action: NDArray[np.float32], sim: Simulation) -> NDArray[np.float64]:
+    """Return a control step as (sum of `_PARTS` + `Simulation.physics_dim`,)."""
+    at, lit = sim.snapshot(), sim.highlights
+    highlight = (*lit[0].position, lit[0].radius) if lit else (np.nan,) * 4
+    parts = action, at.goal_position, at.goal_rotation.ravel(), at.gripper, [at.goes_on], highlight, at.physics
+    return np.concatenate(parts, dtype=np.float64)
+
+
+def prompt_player(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> PromptPlayer:
+    """Return a prompt that is restored if ``file`` contains it, else simulated. Arguments: see `PromptPlayer`."""
+    kept = None if file is None else _read(file, sum(_PARTS) + sim.physics_dim)
+    return PromptPlayer(demonstrator, sim, longest, file) if kept is None else RestoredPrompt(sim, *kept)
 
 
 def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
@@ -160,29 +140,26 @@ def _code() -> tuple[str, ...]:
     return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version
 
 
-def _read(file: Path, physics_dim: int) -> Frames | None:
-    """Return the prompt in a file; None if the file is missing, damaged or of another prompt."""
+def _read(file: Path, width: int) -> tuple[NDArray[np.float64], bool] | None:
+    """Return the rows in a file; None if the file is missing, damaged or of another prompt."""
     try:
         with np.load(file, allow_pickle=False) as stored:
-            name, frames = str(stored["name"]), Frames(*(stored[field] for field in Frames._fields))
+            name, rows, succeeded = str(stored["name"]), stored["rows"], bool(stored["succeeded"])
     except Exception:  # damaged files raise errors of zipfile, zlib, NumPy and the system
         return None
-    n = frames.actions.size // ACTION_DIM
-    shapes = (n, ACTION_DIM), (n, physics_dim), (n, 14), (n,), (n, 4), ()
-    found = [(array.shape, array.dtype.char) for array in frames]
-    if n == 0 or found != [*zip(shapes, "fdd?d?", strict=True)] or name != file.name:
+    if name != file.name or rows.dtype != np.float64 or rows.shape != (len(rows) or 1, width):
         return None
     with contextlib.suppress(OSError):  # read-only folder
         os.utime(file)
-    return frames
+    return rows, succeeded
 
 
-def _write(file: Path, frames: Frames) -> None:
+def _write(file: Path, rows: NDArray[np.float64], succeeded: bool) -> None:
     """Write a prompt; remove the least recently used files beyond `LARGEST` bytes."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(file) as draft:
-            np.savez_compressed(draft, name=np.array(file.name), **frames._asdict())
+            np.savez_compressed(draft, name=np.array(file.name), rows=rows, succeeded=np.array(succeeded))
         _make_room(file.parent)
     except OSError as error:
         _warn(f"prompts cannot be cached in {file.parent} ({error.strerror or error}); set {VARIABLE}=off")

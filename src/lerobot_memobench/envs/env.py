@@ -8,14 +8,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.episode import Episode
+from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
     OMITTED,
     UNKNOWN_POLICY,
@@ -27,7 +27,6 @@ from lerobot_memobench.envs.episode_log import (
     read_log,
 )
 from lerobot_memobench.envs.evaluation_file import write_protocol
-from lerobot_memobench.envs.interference import Interference
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -51,10 +50,10 @@ from lerobot_memobench.protocol import (
     SPLITS,
     UNSEEDED,
 )
-from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of
-from lerobot_memobench.tasks.difficulty import Difficulty
+from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of, task_names
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
+from lerobot_memobench.tasks.task import Task
 
 logger = logging.getLogger(__name__)
 
@@ -80,12 +79,11 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     Args:
         task: name in the catalogue of either suite, or a task folder.
-        settings: settings of the environment; ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
+        settings: ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
         log_dir: folder of the episode log; None for no log.
         acting: description of the policy; episodes of other seeds than the requested ones are not logged or recorded.
         reward: `sparse`: 1 at success. `checkpoints`: 1 / (K + 1) for each of the K memory checkpoints completed in
             order, and 1 / (K + 1) at success, so the sum is at most 1 and reaches 1 only with success.
-        render_mode: ``rgb_array``.
         changes: settings by name that replace those of ``settings``, such as ``obs_type``.
     """
 
@@ -109,7 +107,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             settings = settings.changed(prompt_in=STEPS)
         self.settings = settings
         self.render_mode = render_mode
-        self._task = self._task.at(cast("Difficulty", settings.difficulty))
+        self._task = self._task.at(settings.difficulty)
         self.task = self._task.name
         if settings.needs_prompt and self._task.prompt is None:
             raise MemobenchError(
@@ -126,17 +124,16 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.action_space = action_space()
         self._acting = acting
         self._log_dir = Path(log_dir) if log_dir is not None else None
-        self._log = self._opened_log(log_dir) if log_dir is not None else None
+        self._log: EpisodeLog | None = None
+        if log_dir is not None:
+            protocol = settings.protocol_block | acting.protocol
+            self._log = EpisodeLog(log_dir, partial(write_protocol, Path(log_dir), protocol))
         self._video: VideoRecorder | None = None
         self._observer = Observer(settings)
         self._others: Interference | None = None
         self._began = self._closed = False
         self._not_run: str | None = None
         self._warned: set[str] = set()
-
-    def _opened_log(self, folder: str) -> EpisodeLog:
-        protocol = self.settings.protocol_block | self._acting.protocol
-        return EpisodeLog(folder, partial(write_protocol, Path(folder), protocol))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state of a copy: everything except the running episode, with its scene and generators."""
@@ -151,7 +148,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def _shown(self) -> Episode:
-        """The episode that is observed: the running one, or another one (`interference`)."""
+        """The episode that is observed: the running one, or another one (`Interference`)."""
         return self.episode if self._others is None or self._others.shown is None else self._others.shown
 
     @property
@@ -244,15 +241,10 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if episode.done:
             self._end()
         ended = episode.success or episode.lost or episode.checkpoints_satisfied
-        reward = self._rewarded(episode.progress.index - completed)
+        reward = float(episode.success)
+        if self._reward != SPARSE:
+            reward = (episode.progress.index - completed + reward) / (len(episode.task.checkpoints) + 1)
         return self._observation(), reward, ended, episode.done and not ended, self._info()
-
-    def _rewarded(self, completed: int) -> float:
-        """Return the reward of a step that completed ``completed`` memory checkpoints."""
-        success = self.episode.success
-        if self._reward == SPARSE:
-            return float(success)
-        return (completed + success) / (len(self.episode.task.checkpoints) + 1)
 
     def _observe(self) -> None:
         """Observe the current frame and add it to the video, which skips pauses."""
@@ -277,20 +269,17 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._warn(self._not_run)
 
     def _warn(self, why: str) -> None:
-        """Log the reason that ended an episode, once per reason."""
         if why not in self._warned:
             self._warned.add(why)
             logger.warning("%s, episode %d: %s", self.task, self._number, why)
 
     def _check_began(self, call: str) -> None:
-        """Raise gymnasium's error for a call without a running episode."""
         if self._closed:
             raise ClosedEnvironmentError(f"Trying to call `{call}` on a closed environment; `reset` opens it again")
         if not self._began:
             raise ResetNeeded(f"Cannot call env.{call}() before calling env.reset()")
 
     def _end(self) -> None:
-        """Finish video and log line of an ended episode, once."""
         if self._over:
             return
         self._over = True
@@ -345,7 +334,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return observation
 
     def _offered(self, action: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return an offered action, zeros if the expert cannot do the task."""
+        """Return the action, zeros if the expert cannot do the task."""
         offered: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
         with self._ending_episode():
             offered = action()
@@ -384,6 +373,56 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._video = None
 
 
+class Interference:
+    """Episodes of other tasks between prompt and execution, as further frames of the prompt phase.
+
+    They are of the tasks with a prompt that follow the environment's task in its suite. The scripted expert acts in
+    them; the policy observes. Its clock continues and its memory is not reset.
+    """
+
+    def __init__(self, task: Task, settings: EnvSettings) -> None:
+        names = [name for name in task_names(suite=task.suite) if get_task(name).prompt is not None]
+        first = names.index(task.name) + 1 if task.name in names else 0
+        order = [name for name in (*names[first:], *names[:first]) if name != task.name]
+        self._task = task
+        self._names = [order[k % len(order)] for k in range(settings.interference)]
+        self._settings = settings.changed(interference=0, evidence=False, pause_steps=0, speed=1.0)
+        self._episodes: dict[str, Episode] = {}  # compiled scenes
+        self.shown: Episode | None = None
+
+    def begin(self, seed: int) -> None:
+        """Draw the scenes of an episode, outside all splits."""
+        self._seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
+        self._done = 0
+        self.shown = None
+
+    def step(self, main: Episode) -> bool:
+        """Advance the shown episode by one control step; False if ``main`` itself has to advance."""
+        if not main.waits:
+            return False
+        if self.shown is None:
+            self._open()
+        elif self.shown.done or self.shown.expert_done:
+            self._done += 1
+            if self._done == len(self._names):
+                self.shown = None
+                main.wait(last=True)
+                return True
+            self._open()
+        else:
+            other = self.shown
+            other.step(np.zeros(ACTION_DIM, np.float32) if other.phase == PROMPT else other.expert_action())
+        main.wait()
+        return True
+
+    def _open(self) -> None:
+        name = self._names[self._done]
+        if name not in self._episodes:
+            self._episodes[name] = Episode(get_task(name), self._settings)
+        self.shown = self._episodes[name]
+        self.shown.reset(int(self._seeds[self._done]))
+
+
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     """End logged episodes at their first step with the logged outcome, without simulation.
 
@@ -393,7 +432,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     Args:
         make: makes a `MemobenchEnv`.
         log_dir: folder of the log, read once, at the first reset.
-        settings: settings of the environment.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
@@ -403,7 +441,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         self._skipped: dict[str, Any] | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start the episode of a seed, or skip it if it is logged."""
+        """Start the episode of a seed, or skip it."""
         self._skipped = None if seed is None else self._records().get(seed - self._settings.seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
@@ -437,7 +475,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def _black(settings: EnvSettings) -> NDArray[np.uint8]:
-    """Return the rendered frame of an episode that is not run."""
     return np.zeros((BAND + settings.observation_height, 2 * settings.observation_width, 3), np.uint8)
 
 

@@ -21,13 +21,13 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 
 import lerobot_memobench.envs
 from lerobot_memobench.datasets.demonstration import labels
+from lerobot_memobench.envs import env as environment
 from lerobot_memobench.envs import episode as episode_module
-from lerobot_memobench.envs import memobench_env
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import differences, read_episodes, read_log
 from lerobot_memobench.envs.evaluation_file import protocol_of
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import CHECKPOINTS, SPARSE
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS, RESET, STEPS
@@ -547,7 +547,7 @@ def test_episodes_without_a_seed_are_outside_all_splits(tmp_path: Path) -> None:
 def test_sealed_scene_is_logged_once_outside_of_the_sealed_test(
     caplog: pytest.LogCaptureFixture, salt: str | None
 ) -> None:
-    memobench_env._warn_of_sealed_seeds.cache_clear()
+    environment._warn_of_sealed_seeds.cache_clear()
     env = make(salt=salt)
     for seed, lines in ((7, 0), (100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
         env.reset(seed=seed)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from datetime import datetime
@@ -31,10 +31,10 @@ from lerobot_memobench.envs.observations import (
     observation_space,
     policy_features,
     policy_names,
-    prompt_in,
+    reads_prompt,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, INTACT, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, INTACT, RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import (
@@ -186,30 +186,24 @@ class MemobenchEnvConfig(_WithSettings):
         A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
         this; ``prompt_in=auto`` then means `STEPS`.
         """
-        if self.task is not None:
-            return self._envs_of_suites(self.task.split(","), n_envs, use_async_envs)
+        envs: dict[str, dict[int, gym.vector.VectorEnv]] = {}
+        if self.task is not None:  # suites of LIBERO, each with its own defaults and folder of its log
+            folder = self.resolved_log_dir()
+            for suite in self.task.split(","):
+                own = asdict(self.settings.changed(suite=suite))
+                one = replace(self, task=None, log_dir=str(folder / suite), **own)
+                envs |= one.create_envs(n_envs, use_async_envs)
+                self.features, self.features_map = one.features, one.features_map  # of the checkpoint's convention
+            return envs
         self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         policy, by = type(self).check_policy(self)
         self.declare_plans(policy)
         opened = self.opener(None, by, self.resolved_log_dir())
-        suites: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for memory_type, task_id, folder in chosen:
-            suites.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
-        return suites
-
-    def _envs_of_suites(
-        self, suites: Sequence[str], n_envs: int, use_async_envs: bool
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """Return the environments of several suites of LIBERO, each with its own defaults and folder of its log."""
-        folder, found = self.resolved_log_dir(), dict[str, dict[int, gym.vector.VectorEnv]]()
-        for suite in suites:
-            own = asdict(self.settings.changed(suite=suite))
-            one = replace(self, task=None, log_dir=str(folder / suite), **own)
-            found |= one.create_envs(n_envs, use_async_envs)
-            self.features, self.features_map = one.features, one.features_map  # of the checkpoint's convention
-        return found
+            envs.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
+        return envs
 
     def _number_as_lerobot(self) -> None:
         """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state.
@@ -246,7 +240,7 @@ class MemobenchEnvConfig(_WithSettings):
         """
         settings = self.settings
         if settings.prompt_in == AUTO:
-            settings = settings.changed(prompt_in=STEPS if policy is None else prompt_in(policy))
+            settings = settings.changed(prompt_in=STEPS if policy is None or reads_prompt(policy) else RESET)
         executed = executed_actions(policy)
         if settings.replan_steps is None:
             if self.suite == STRICT and (policy is None or getattr(policy, "plans_unseen", False)):
@@ -268,12 +262,11 @@ class MemobenchEnvConfig(_WithSettings):
         Args:
             policy: configuration of the policy; None if unknown.
             by: description of the policy for the log.
-            log_dir: folder of the episode log.
 
         Raises:
-            MemobenchError: the folder contains a log of another protocol.
+            MemobenchError: ``log_dir`` contains a log of another protocol.
         """
-        from lerobot_memobench.envs.memobench_env import MemobenchEnv, SkipLogged
+        from lerobot_memobench.envs.env import MemobenchEnv, SkipLogged
 
         settings = self.settings_for(policy)
         check_protocol(log_dir, settings.protocol_block | by.protocol)  # fail before the first episode
@@ -303,7 +296,7 @@ class MemobenchEnvConfig(_WithSettings):
 
 
 def executed_actions(policy: Any) -> int:
-    """Return the number of actions that a policy of this configuration executes per plan; 0 if it states none."""
+    """Return the number of actions that a policy executes per plan; 0 if its configuration states none."""
     stated = max(getattr(policy, name, None) or 0 for name in EXECUTED)
     if getattr(policy, "type", None) != "groot":
         return stated
@@ -316,11 +309,7 @@ def executed_actions(policy: Any) -> int:
 
 
 def check_loop(settings: EnvSettings) -> None:
-    """Refuse corruption in the loops of other tools, which do not pass it on to the policy.
-
-    Raises:
-        MemobenchError: the settings ask for it.
-    """
+    """Raise `MemobenchError` for corruption in the loops of other tools, which do not pass it on to the policy."""
     if settings.corrupt != INTACT:
         raise MemobenchError(
             f"found corrupt={settings.corrupt} in a loop that cannot change a policy's memory; use `lerobot eval "
@@ -335,7 +324,7 @@ def _vector(
 
     if use_async_envs:
         # Workers are forked from a server, which imports torch and the simulator once.
-        get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.memobench_env"])
+        get_context("forkserver").set_forkserver_preload(["lerobot_memobench.envs.env"])
         space = observation_space(settings, longest(settings))
         return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
     # LeRobot freezes finished rows of async environments only; a sync row would start another episode.
@@ -350,7 +339,7 @@ class ClockProcessorStep(ObservationProcessorStep):
     """Reshape phase and step from (B, 1) to (B,), the shape of one-number columns in a LeRobot training batch."""
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation with phase and step of shape (B,)."""
+        """Reshape; see the class."""
         return {key: value.reshape(len(value)) if key in CLOCK else value for key, value in observation.items()}
 
     def transform_features(
