@@ -121,7 +121,7 @@ def test_generate_reports_every_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], solved: int
 ) -> None:
     from lerobot_memobench.datasets import generation
-    from lerobot_memobench.datasets.generation import Failure, GenerationSummary, TaskSummary
+    from lerobot_memobench.datasets.generate import Failure, GenerationSummary, TaskSummary
     from lerobot_memobench.jobs.processes import Advance
 
     asked: dict[str, object] = {}

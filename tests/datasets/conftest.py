@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom

@@ -20,16 +20,13 @@ from lerobot_memobench.datasets import convert as convert_module
 from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert, find_files
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.episodes import read_episode, read_info, read_manifest
 from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.layout import is_dataset
 from lerobot_memobench.datasets.restore import ORIENTATIONS, restore, task_of
 from lerobot_memobench.datasets.validate import images_of, replay
-from lerobot_memobench.datasets.video import VideoWriter
+from lerobot_memobench.datasets.video import VideoWriter, frame_reader
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import in_words
 from lerobot_memobench.sim.convention import CONVENTIONS, convention_of

@@ -13,12 +13,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_memobench.datasets import recording
-from lerobot_memobench.datasets.generation import generate
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets import record as recording
+from lerobot_memobench.datasets.episodes import read_info
+from lerobot_memobench.datasets.generate import generate
+from lerobot_memobench.datasets.layout import is_dataset
 from lerobot_memobench.datasets.validate import episode_count
+from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
@@ -183,8 +183,8 @@ IN_C = RuntimeError("Can't write data (file write failed: errno = 28, error mess
 @pytest.mark.parametrize(
     ("place", "error"),
     [
-        ("lerobot_memobench.datasets.staging.np.savez_compressed", FULL),
-        ("lerobot_memobench.datasets.lerobot_format.assembling.ParquetFiles.write", IN_C),
+        ("lerobot_memobench.datasets.stage.np.savez_compressed", FULL),
+        ("lerobot_memobench.datasets.write.ParquetFiles.write", IN_C),
     ],
 )
 def test_full_disk_keeps_finished_episodes(tasks, recorded, tmp_path, monkeypatch, place, error):
@@ -194,7 +194,7 @@ def test_full_disk_keeps_finished_episodes(tasks, recorded, tmp_path, monkeypatc
 
     def full(*args, **kwargs):
         calls.append(place)
-        if len(calls) > 2 or "lerobot_format" in place:
+        if len(calls) > 2 or "ParquetFiles" in place:
             raise error
         return inner(*args, **kwargs)
 

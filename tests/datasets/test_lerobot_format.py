@@ -12,14 +12,13 @@ from huggingface_hub import DatasetCard
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
+from lerobot_memobench.datasets.card import card_from_frames, terms
 from lerobot_memobench.datasets.demonstration import digest, labels
-from lerobot_memobench.datasets.lerobot_format.assembling import assemble, numeric_stats, write_dataset
-from lerobot_memobench.datasets.lerobot_format.card import card_from_frames, terms
-from lerobot_memobench.datasets.lerobot_format.columns import dataset_features
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.episodes import read_episode
+from lerobot_memobench.datasets.layout import dataset_features, is_dataset
+from lerobot_memobench.datasets.stage import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
+from lerobot_memobench.datasets.write import assemble, numeric_stats, write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.scene_hash import LIBERO

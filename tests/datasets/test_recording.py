@@ -14,10 +14,10 @@ import pandas as pd
 import pytest
 
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.recording import HOLD_FRAMES
+from lerobot_memobench.datasets.episodes import read_episode
+from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, suite_of, task_names
@@ -115,8 +115,8 @@ RECORD = """
 import json
 import sys
 from pathlib import Path
-from lerobot_memobench.datasets.recording import RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging import staged
+from lerobot_memobench.datasets.record import RecordingJob, RecordingSettings
+from lerobot_memobench.datasets.stage import staged
 from lerobot_memobench.tasks.catalogue import get_task
 
 task, seed, settings, folder = sys.argv[1:]

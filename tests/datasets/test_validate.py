@@ -23,14 +23,13 @@ from lerobot.datasets.io_utils import load_tasks, write_tasks
 from lerobot_memobench.cli import data as commands
 from lerobot_memobench.datasets import statistics
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
+from lerobot_memobench.datasets.episodes import check_revision, list_episodes, read_episode, read_info
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.columns import image_key
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes, read_episode
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.layout import image_key
 from lerobot_memobench.datasets.statistics import check_statistics, complete, lacking, measured
-from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
+from lerobot_memobench.datasets.validate import CheckResult, images_of, replay, validate
 from lerobot_memobench.datasets.video import ImageHistograms
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import LEVELS
@@ -197,7 +196,7 @@ def test_verdicts_of_episodes_and_files(tmp_path, stove):
     folder = write_dataset(demos, tmp_path / "ds")
     news = []
     verdicts = validate(folder, progress=lambda *each: news.append(each))
-    assert verdicts == [Verdict("episode 0", None), Verdict("episode 1", None)]
+    assert verdicts == [CheckResult("episode 0", None), CheckResult("episode 1", None)]
     assert [done for done, *_ in news] == list(range(1, news[0][1] + 1))
     change(folder, "data/**/*.parquet", "checkpoint.index", 5)
     shutil.rmtree(folder / "states")

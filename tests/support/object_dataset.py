@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, OBJECTS, PRIVILEGED
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.episodes import DemonstrationRecord
+from lerobot_memobench.datasets.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.scene_hash import LIBERO
@@ -37,7 +37,7 @@ def state_at(hand: np.ndarray) -> np.ndarray:
 def record_of(name: str, seed: int, prompt: int, world: str | None) -> str:
     """Return the record of an episode, as `memobench generate` writes it."""
     told = {"memory_type": "object", "referent": "random", "variant": 0, "key_frames": [-1], "world": world}
-    return EpisodeRecord(task_name=name, seed=seed, exec_start_index=prompt, **told).in_frames()
+    return DemonstrationRecord(task_name=name, seed=seed, exec_start_index=prompt, **told).in_frames()
 
 
 def make_object_dataset(

@@ -21,8 +21,8 @@ from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import GenerationSummary
-    from lerobot_memobench.datasets.validate import Verdict
+    from lerobot_memobench.datasets.generate import GenerationSummary
+    from lerobot_memobench.datasets.validate import CheckResult
     from lerobot_memobench.jobs.processes import Advance
 
 
@@ -69,8 +69,8 @@ def generate(
         )
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import episodes_of
-    from lerobot_memobench.datasets.generation import generate as run
+    from lerobot_memobench.datasets.generate import episodes_of
+    from lerobot_memobench.datasets.generate import generate as run
 
     screen = console()
     total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
@@ -230,7 +230,7 @@ def view(
     ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
-    from lerobot_memobench.datasets.lerobot_format.tables import read_info
+    from lerobot_memobench.datasets.episodes import read_info
     from lerobot_memobench.training.view import choice_for, write_view
 
     if obs_type is not None:
@@ -251,7 +251,7 @@ def validate(
 
     The first disagreement of each is reported, and files that were written again.
     """
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
+    from lerobot_memobench.datasets.episodes import check_suite_of
     from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
 
@@ -259,7 +259,7 @@ def validate(
         check_suite_of(folder, suite)
     with counting(console(), "episodes") as count:
 
-        def advance(done: int, total: int, verdict: Verdict) -> None:
+        def advance(done: int, total: int, verdict: CheckResult) -> None:
             count(done, total, verdict.subject, trouble=verdict.disagreement)
 
         verdicts = run(folder, workers=workers, progress=advance)
@@ -280,7 +280,7 @@ def push(
     """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
     continues a broken upload. Files of an earlier dataset there are deleted.
     """
-    from lerobot_memobench.datasets.publish import push as run
+    from lerobot_memobench.datasets.card import push as run
 
     say(f"dataset: {run(folder, repo_id, private=private, notify=say)}")
     return 0
@@ -292,8 +292,8 @@ def describe(
     suite: OfSuite = None,
 ) -> int:
     """Summarise a dataset. The card's tables and the hash of every episode, small enough to commit."""
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
-    from lerobot_memobench.datasets.publish import describe as run
+    from lerobot_memobench.datasets.card import describe as run
+    from lerobot_memobench.datasets.episodes import check_suite_of
 
     if suite is not None:
         check_suite_of(folder, suite)

@@ -17,8 +17,8 @@ from torch.overrides import TorchFunctionMode
 
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import check_clock, objects_column
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.layout import check_clock, objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest

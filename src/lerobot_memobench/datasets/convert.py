@@ -24,7 +24,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.generation import check_room, run_size
+from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
+from lerobot_memobench.datasets.generate import check_room, run_size
 from lerobot_memobench.datasets.hdf5 import (
     NO_SEED,
     PublishedDemo,
@@ -34,10 +35,7 @@ from lerobot_memobench.datasets.hdf5 import (
     first_line,
     unusable_on_error,
 )
-from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING
-from lerobot_memobench.datasets.lerobot_format.manifest import Problem
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.restore import (
     ORIENTATIONS,
     orientation_of,
@@ -45,7 +43,7 @@ from lerobot_memobench.datasets.restore import (
     task_of,
     unlike_the_catalogue,
 )
-from lerobot_memobench.datasets.staging import (
+from lerobot_memobench.datasets.stage import (
     EpisodeStage,
     StagedJob,
     check_destination,
@@ -54,6 +52,7 @@ from lerobot_memobench.datasets.staging import (
     stage_failure,
     staged,
 )
+from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import (
     Count,
@@ -94,8 +93,8 @@ class ConversionSummary:
 
     folder: Path | None
     episodes: int
-    problems: tuple[Problem, ...]
-    notes: tuple[Problem, ...] = ()
+    problems: tuple[ConversionNote, ...]
+    notes: tuple[ConversionNote, ...] = ()
 
     @property
     def exit_status(self) -> int:
@@ -139,7 +138,9 @@ def convert(
     request = {"files": [file.identity for file in files], "convention": convention}
     manifest = finished_manifest(out, request, "left_out")
     if manifest is not None:
-        left_out, noted = (tuple(map(Problem.model_validate, manifest.get(key, []))) for key in ("left_out", "notes"))
+        left_out, noted = (
+            tuple(map(ConversionNote.model_validate, manifest.get(key, []))) for key in ("left_out", "notes")
+        )
         return ConversionSummary(out, len(manifest["episodes"]), left_out, noted)
     check_destination(out)
     with (
@@ -197,7 +198,7 @@ class SourceFile:
     member: zipfile.ZipInfo | None = None
 
 
-def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Problem]]:
+def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[ConversionNote]]:
     """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
 
     Args:
@@ -215,7 +216,7 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Pro
                 name = "/".join(file_name(part, "a part of its name") for part in info.filename.split("/"))
             except MemobenchError as error:
                 printable = "".join(letter if letter.isprintable() else "?" for letter in info.filename)[:200]
-                refused.append(Problem(file=printable, group="", reason=str(error)))
+                refused.append(ConversionNote(file=printable, group="", reason=str(error)))
             else:
                 identity = [name, info.file_size, info.CRC]
                 files.append(SourceFile(name, info.file_size, unpacked / name, identity, info))
@@ -289,8 +290,8 @@ class Findings(BaseModel):
     """Demonstrations, problems and notes of a file, and how its images are stored."""
 
     demonstrations: list[Sound] = []
-    problems: list[Problem] = []
-    notes: list[Problem] = []
+    problems: list[ConversionNote] = []
+    notes: list[ConversionNote] = []
     orientation: str | None = None
 
 
@@ -299,7 +300,7 @@ def inspect(file: SourceFile) -> Findings:
     found = Findings()
 
     def leave_out(group: str, reason: object) -> None:
-        found.problems.append(Problem(file=file.name, group=group, reason=str(reason)))
+        found.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
 
     try:
         with PublishedFile(file.path) as opened, unusable_on_error():
@@ -317,14 +318,14 @@ def inspect(file: SourceFile) -> Findings:
                     continue
                 height, width = demo.image_size
                 found.demonstrations.append(Sound(group=group, height=height, width=width))
-                notes = [Problem(file=file.name, group="", reason=note) for note in _notes(opened, demo)]
+                notes = [ConversionNote(file=file.name, group="", reason=note) for note in _notes(opened, demo)]
                 found.notes += [note for note in notes if note not in found.notes]
     except Unusable as error:
         leave_out("", error)
     if found.demonstrations and found.orientation != UPRIGHT:
         unclear = "whether its images are upright is not clear, as its state shows none like them: they are not turned"
         turned = f"its images are {found.orientation}: they are turned"
-        found.notes.append(Problem(file=file.name, group="", reason=turned if found.orientation else unclear))
+        found.notes.append(ConversionNote(file=file.name, group="", reason=turned if found.orientation else unclear))
     return found
 
 
@@ -362,8 +363,8 @@ class _Conversion:
         files: Sequence[SourceFile],
     ) -> None:
         self.jobs: list[ConversionJob] = []
-        self.problems: list[Problem] = []
-        self.notes: list[Problem] = []
+        self.problems: list[ConversionNote] = []
+        self.notes: list[ConversionNote] = []
         self._source, self._staging, self._folder, self._convention = source, staging, folder, convention
         self._workers, self._progress, self._files = workers, progress, files
         self._resumed = 0
@@ -388,7 +389,7 @@ class _Conversion:
         failed = [(f"data/{job.group}", reason) for job in jobs if (reason := job.failure()) is not None]
         self.problems += [
             *findings.problems,
-            *(Problem(file=file.name, group=group, reason=reason) for group, reason in failed),
+            *(ConversionNote(file=file.name, group=group, reason=reason) for group, reason in failed),
         ]
         self.notes += findings.notes
 
@@ -404,7 +405,7 @@ class _Conversion:
         except Unusable as error:
             if findings is not None:  # an earlier run found its demonstrations
                 raise MemobenchError(f"{self._source}, {file.name}: {error}") from None
-            problem = Problem(file=file.name, group="", reason=str(error))
+            problem = ConversionNote(file=file.name, group="", reason=str(error))
             return Findings(problems=[problem])
         return findings
 
@@ -485,5 +486,5 @@ class ConversionJob(StagedJob):
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
             demo = restore(task_of(file, found), found)
-            EpisodeRecord.of(demo)  # a bad value ends this episode, not the assembly of all
+            DemonstrationRecord.of(demo)  # a bad value ends this episode, not the assembly of all
             return demo

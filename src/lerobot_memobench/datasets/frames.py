@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
-from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.episodes import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.layout import OBJECTS, PRIVILEGED, check_clock, objects_column
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
 

@@ -19,37 +19,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
-from lerobot_memobench.datasets.images import FrameReader, frame_reader
-from lerobot_memobench.datasets.lerobot_format.columns import (
-    EXECUTED_ACTION,
-    LANGUAGE,
-    OBJECTS,
-    check_clock,
-    image_key,
-    objects_column,
-)
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole, expect, read_to_end
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    ADVICE,
-    EPISODES,
-    INFO_FILE,
-    MANIFEST_FILE,
-    STATS_FILE,
-    dataset_files,
-    is_dataset,
-)
-from lerobot_memobench.datasets.lerobot_format.manifest import Written, read_manifest
-from lerobot_memobench.datasets.lerobot_format.reading import (
+from lerobot_memobench.datasets.episodes import (
     Columns,
+    DemonstrationRecord,
     EpisodePlace,
+    FileHash,
     RecordedEpisode,
     check_revision,
+    check_whole,
+    expect,
     list_episodes,
     read_episode,
+    read_info,
+    read_manifest,
+    read_table,
+    read_to_end,
 )
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.lerobot_format.tables import read_info, read_table
+from lerobot_memobench.datasets.layout import (
+    ADVICE,
+    EPISODES,
+    EXECUTED_ACTION,
+    INFO_FILE,
+    LANGUAGE,
+    MANIFEST_FILE,
+    OBJECTS,
+    STATS_FILE,
+    check_clock,
+    dataset_files,
+    image_key,
+    is_dataset,
+    objects_column,
+)
 from lerobot_memobench.datasets.statistics import check_statistics, measured
+from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
@@ -73,7 +75,7 @@ NO_HASHES = (
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CheckResult:
     """Outcome of the check of an episode or a file.
 
     Attributes:
@@ -101,17 +103,19 @@ class _Check:
     of_file: bool
     check: Callable[[], str | None]
 
-    def run(self) -> Verdict:
+    def run(self) -> CheckResult:
         """Run the check."""
         try:
             with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.path):
                 found = self.check()
         except MemobenchError as error:  # the other checks still run
-            return Verdict(self.subject, str(error), of_file=self.of_file)
-        return Verdict(self.subject, None, found, of_file=True) if self.of_file else Verdict(self.subject, found)
+            return CheckResult(self.subject, str(error), of_file=self.of_file)
+        return (
+            CheckResult(self.subject, None, found, of_file=True) if self.of_file else CheckResult(self.subject, found)
+        )
 
 
-ValidationProgress = Callable[[int, int, Verdict], None]
+ValidationProgress = Callable[[int, int, CheckResult], None]
 """Called with the number of finished checks, their total, and the latest verdict."""
 
 
@@ -121,7 +125,7 @@ def validate(
     workers: int = 1,
     tasks: Mapping[str, Task] | None = None,
     progress: ValidationProgress | None = None,
-) -> list[Verdict]:
+) -> list[CheckResult]:
     """Replay the episodes of a dataset and check its files.
 
     States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
@@ -144,9 +148,9 @@ def validate(
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
     checks = [*_episode_checks(folder, tasks), *_file_checks(folder)]
-    verdicts: dict[int, Verdict] = {}
+    verdicts: dict[int, CheckResult] = {}
 
-    def note(number: int, verdict: Verdict) -> None:
+    def note(number: int, verdict: CheckResult) -> None:
         verdicts[number] = verdict
         if progress is not None:
             progress(len(verdicts), len(checks), verdict)
@@ -185,7 +189,7 @@ def _reader(folder: Path, camera: str) -> FrameReader:
     return frame_reader(folder, camera)
 
 
-def exit_status(verdicts: Sequence[Verdict]) -> int:
+def exit_status(verdicts: Sequence[CheckResult]) -> int:
     """Return 0 if everything agrees, else 1."""
     return 1 if any(verdict.disagreement is not None for verdict in verdicts) else 0
 
@@ -254,7 +258,7 @@ def episode_count(folder: Path) -> int:
     return count
 
 
-def check_file(path: Path, written: Written | None) -> str | None:
+def check_file(path: Path, written: FileHash | None) -> str | None:
     """Read a file to its end and compare it with its recorded hash; return a note if it was written again.
 
     Other bytes in a file of equal size are damage; tools that encode or write a file again change its size.
@@ -380,7 +384,7 @@ def replay(
         MemobenchError: there is no such task, or the actions were removed.
     """
     if isinstance(recorded, Demonstration):
-        record, task, start = EpisodeRecord.of(recorded), recorded.task, 0
+        record, task, start = DemonstrationRecord.of(recorded), recorded.task, 0
         wanted, executed, held = recorded.actions, recorded.applied, recorded.held
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
@@ -522,7 +526,7 @@ def _columns(demo: Demonstration, objects: str) -> Columns:
 
 
 def _whole(demo: Demonstration) -> dict[str, Any]:
-    return EpisodeRecord.of(demo).determined() | {LANGUAGE: persistent_rows(labels(demo))}
+    return DemonstrationRecord.of(demo).determined() | {LANGUAGE: persistent_rows(labels(demo))}
 
 
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:

@@ -20,6 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lerobot_memobench.datasets.episodes import check_revision, list_episodes, read_info
 from lerobot_memobench.datasets.frames import (
     Encoded,
     FrameLookup,
@@ -29,10 +30,7 @@ from lerobot_memobench.datasets.frames import (
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
-from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.layout import EPISODE_INFO, check_clock, without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of

@@ -32,17 +32,19 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from PIL import Image, ImageOps
 
 from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
+from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import LANGUAGE, PRIVILEGED, image_key
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.layout import (
     EPISODES,
     INFO_FILE,
+    LANGUAGE,
+    PRIVILEGED,
     STATS_FILE,
     TASKS_FILE,
+    image_key,
     without_pattern,
 )
-from lerobot_memobench.datasets.lerobot_format.tables import read_info, tables_of, undamaged
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.datasets.video import mirror_video, video_info
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt

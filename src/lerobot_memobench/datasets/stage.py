@@ -31,10 +31,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, TOP_LEVEL, is_dataset
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
+from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
@@ -221,7 +219,7 @@ class EpisodeStage:
 
 def episode_info(demo: Demonstration) -> dict[str, Any]:
     """Return the fields of an episode for meta/episodes, manifest and card."""
-    record = EpisodeRecord.of(demo).model_dump(exclude={"versions"})
+    record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
     return record | {"language": demo.task.language, "frames": len(demo)}
 
 

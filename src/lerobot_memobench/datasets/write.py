@@ -16,26 +16,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.datasets.card import write_card
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
-from lerobot_memobench.datasets.lerobot_format.card import write_card
-from lerobot_memobench.datasets.lerobot_format.columns import (
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, FileHash
+from lerobot_memobench.datasets.layout import (
+    DEFAULT_REPO_ID,
     EPISODE_INFO,
     EXECUTED_ACTION,
     LANGUAGE,
-    dataset_features,
-    image_key,
-    objects_column,
-)
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    DEFAULT_REPO_ID,
     MANIFEST_FILE,
     STAGING,
     TOP_LEVEL,
+    dataset_features,
     dataset_files,
+    image_key,
+    objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.manifest import Written
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.staging import (
+from lerobot_memobench.datasets.stage import (
     TEMPORARY,
     StagedEpisode,
     check_destination,
@@ -178,7 +175,7 @@ def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], bu
     write_file(build / MANIFEST_FILE, json.dumps(content, indent=1), durable=True)
 
 
-def _written_files(folder: Path) -> dict[str, Written]:
+def _written_files(folder: Path) -> dict[str, FileHash]:
     """Return size and hash of each of a dataset's files, for its manifest."""
     return {
         name: {"bytes": (folder / name).stat().st_size, "sha256": file_hash(folder / name)}
@@ -221,7 +218,7 @@ def _write_frames(
         task, length = str(episode.info["language"]), int(episode.info["frames"])
         meta.save_episode_tasks([task])
         arrays = episode.arrays()
-        record = EpisodeRecord.model_validate(episode.info | {"versions": versions})
+        record = DemonstrationRecord.model_validate(episode.info | {"versions": versions})
         numbering = {
             "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
             "frame_index": np.arange(length),
@@ -252,7 +249,10 @@ def _write_frames(
 
 
 def _columns(
-    arrays: Mapping[str, NDArray], numbering: Mapping[str, NDArray], record: EpisodeRecord, features: Collection[str]
+    arrays: Mapping[str, NDArray],
+    numbering: Mapping[str, NDArray],
+    record: DemonstrationRecord,
+    features: Collection[str],
 ) -> dict[str, NDArray]:
     info = np.full(len(arrays["actions"]), "", dtype=object)
     info[0] = record.in_frames()
