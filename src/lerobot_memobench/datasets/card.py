@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from lerobot_memobench.datasets.episodes import (
     STRANGER,
     DemonstrationRecord,
-    EpisodePlace,
+    ListedEpisode,
     check_whole,
     list_episodes,
     naming_damage,
@@ -28,10 +29,9 @@ from lerobot_memobench.datasets.stage import StagedEpisode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, write_file
 from lerobot_memobench.sim.convention import convention_of
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 
-CARD_FILE = "README.md"
+CARD_FILE, TABLES_FILE = "README.md", "tables.md"
 MADE_BY = "## How it was made"
 """Heading in cards of this package, which LeRobot's cards do not have."""
 EDITED = (
@@ -58,10 +58,18 @@ LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
 }
 """Steps [from, to) -> episodes of the paper's 1,500."""
 
+Described = tuple[DemonstrationRecord, int]
+"""Record and length of an episode of this benchmark."""
+Notify = Callable[[str], None]
+
+
+# --- the card ---
+
 
 def write_card(
     folder: Path,
-    episodes: Sequence[StagedEpisode],
+    episodes: Iterable[ListedEpisode],
+    failed: Sequence[StagedEpisode],
     features: dict[str, dict[str, Any]],
     *,
     repo_id: str,
@@ -69,17 +77,21 @@ def write_card(
     left_out: Sequence[str] = (),
 ) -> None:
     """Write ``folder``/README.md: introduction, making, statistics, columns, limitations, licence."""
-    solved = [episode for episode in episodes if episode.failure is None]
-    failed = [episode for episode in episodes if episode.failure is not None]
+    described = described_of(folder, episodes)
+    requested = len(described) + len(failed)
     made = [
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
-        "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame).",
-        _failures(failed, len(episodes)),
+        "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame)."
     ]
+    if failed:
+        seeds = (f"- {each.info['task_name']}, seed {each.info['seed']}: {each.failure}" for each in failed)
+        heading = f"**{len(failed)} of {requested} requested seeds have no demonstration:**"
+        made.append(heading + "\n\n" + "\n".join(seeds))
+    else:
+        made.append(f"All {requested} requested seeds were solved.")
     if left_out:
-        made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {problem}" for problem in left_out))
-    infos = [episode.info for episode in solved]
-    text = _card(infos, failed, features, _size(folder), made, f'"{repo_id}", root="<this folder>"')
+        made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {note}" for note in left_out))
+    text = _card(folder, described, failed, features, made, f'"{repo_id}", root="<this folder>"')
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -92,17 +104,10 @@ def own_card(folder: Path, count: int) -> str | None:
     return card if MADE_BY in card and f"\n{count} demonstrations of " in card else None
 
 
-def card_from_frames(folder: Path, rows: Sequence[Mapping[str, Any]], repo_id: str | None = None) -> str:
-    """Return a card for a dataset that has lost its own.
-
-    Args:
-        folder: the dataset.
-        rows: records of its episodes, each with its ``length`` (`records_of`).
-        repo_id: its address on the hub; None if it is loaded from a folder.
-    """
-    infos = [{**row, "frames": row["length"]} for row in rows]
+def card_from_frames(folder: Path, episodes: Sequence[Described], repo_id: str | None = None) -> str:
+    """Return a card for a dataset that has lost its own; ``repo_id`` is its address on the hub, None of a folder."""
     location = f'"{repo_id}"' if repo_id else '"local/demonstrations", root="<this folder>"'
-    return _card(infos, [], read_info(folder)["features"], _size(folder), [EDITED], location)
+    return _card(folder, episodes, [], read_info(folder)["features"], [EDITED], location)
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
@@ -112,73 +117,69 @@ def hub_card(folder: Path, repo_id: str) -> str:
         MemobenchError: the dataset is damaged, or none of its episodes is one of this benchmark.
     """
     with undamaged(folder):
-        places = list_episodes(folder)
-        card = own_card(folder, len(places))
+        episodes = list_episodes(folder)
+        card = own_card(folder, len(episodes))
     if card is not None:
         return re.sub(r'LeRobotDataset\("[^"\n]*", root="[^"\n]*"\)', f'LeRobotDataset("{repo_id}")', card)
-    return card_from_frames(folder, records_of(folder, places), repo_id)
+    return card_from_frames(folder, described_of(folder, episodes), repo_id)
 
 
-def records_of(folder: Path, places: Iterable[EpisodePlace]) -> list[dict[str, Any]]:
-    """Return the records of episodes, each with its ``length``, without episodes of other programs.
+def described_of(folder: Path, episodes: Iterable[ListedEpisode]) -> list[Described]:
+    """Return records and lengths of a dataset's episodes, without episodes of other programs.
 
     Raises:
         MemobenchError: no episode has a record.
     """
-    rows = [{**place.record.model_dump(), "length": place.length} for place in places if place.record is not None]
-    if not rows:
+    described = [(episode.record, episode.length) for episode in episodes if episode.record is not None]
+    if not described:
         raise MemobenchError(f"{folder} has no episode of this benchmark: {STRANGER}")
-    return rows
+    return described
 
 
 def _card(
-    infos: Sequence[dict[str, Any]],
+    folder: Path,
+    episodes: Sequence[Described],
     failed: Sequence[StagedEpisode],
     features: Mapping[str, dict[str, Any]],
-    size: int,
     made: Sequence[str],
     location: str,
 ) -> str:
-    """Return the card.
-
-    Args:
-        infos: information on the episodes, with their ``frames``.
-        failed: seeds without a demonstration.
-        features: columns of the dataset.
-        size: bytes of the dataset.
-        made: paragraphs on its making.
-        location: arguments of ``LeRobotDataset`` that load it.
-    """
-    licence, is_libero, of_authors = terms(infos)
+    """Return the card; ``made`` are paragraphs on its making, ``location`` the arguments of ``LeRobotDataset``."""
+    records = [record for record, _ in episodes]
+    fields = ("task_name", "memory_type", "operations", "exec_start_index")
+    table = pd.DataFrame([record.model_dump(include={*fields}) | {"frames": length} for record, length in episodes])
+    types = [name for name in FAMILIES if name in {*table.memory_type}]
+    types += sorted({*table.memory_type} - {*FAMILIES})
+    of_authors = parts_of_authors(records)
     data = DatasetCardData(
-        license=licence,
+        license="cc-by-nc-4.0" if of_authors else "other",
         task_categories=["robotics"],
         tags=["LeRobot", "memobench", "memory", "manipulation", "simulation", "mujoco"],
         language=["en"],
-        size_categories=["n<1K" if len(infos) < 1000 else "1K<n<10K"],
+        size_categories=["n<1K" if len(records) < 1000 else "1K<n<10K"],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
-    total = _figures(infos)
-    shown = [[f"`{key}`", _type(ft), MEANINGS[key]] for key, ft in features.items() if key in MEANINGS]
-    described = DemonstrationRecord.meanings().items()
+    prompts = table.groupby("memory_type").exec_start_index.mean()
+    content = [folder / part for part in ("data", "meta", "states", "videos")]
+    size = sum(path.stat().st_size for part in content for path in files_below(part))
+    columns = [[f"`{key}`", _type(feature), MEANINGS[key]] for key, feature in features.items() if key in MEANINGS]
+    meanings = DemonstrationRecord.meanings().items()
     card = DatasetCard.from_template(
         data,
         str(Path(__file__).with_name("card.md.jinja")),
-        total=total,
-        types=ordered_types(infos),
-        former=any(info.get(WORLD) != LIBERO for info in infos),
-        stand_ins=sorted({name for info in infos for name in info.get("stand_ins") or ()}),
+        total=_statistics(table),
+        types=types,
+        stand_ins=sorted({name for record in records for name in record.stand_ins}),
         location=location,
-        made=[paragraph for paragraph in made if paragraph],
-        lengths=_lengths_table(infos),
-        bytes_per_frame=f"{size / total['steps']:,.0f}",
-        prompts=_prompts(infos),
-        buckets=_buckets_table(infos),
-        tasks=_tasks_table(infos, failed),
+        made=made,
+        lengths=_lengths_table(table, types),
+        bytes_per_frame=f"{size / table.frames.sum():,.0f}",
+        prompts=[f"{prompts[name]:.1f} in {name} tasks" for name in types if prompts[name]],
+        buckets=_buckets_table(table.frames),
+        tasks=_tasks_table(table, failed),
         convention=convention_of(features),
-        columns=markdown(["column", "type", "meaning"], shown),
-        episode_columns=markdown(["column", "meaning"], [[f"`{key}`", text] for key, text in described]),
-        is_libero=is_libero,
+        columns=markdown(["column", "type", "meaning"], columns),
+        episode_columns=markdown(["column", "meaning"], [[f"`{key}`", text] for key, text in meanings]),
         of_authors=of_authors,
     )
     return str(card).rstrip() + "\n"
@@ -189,90 +190,43 @@ def _type(feature: dict[str, Any]) -> str:
     return feature["dtype"] if shape == (1,) else f"{feature['dtype']} {'×'.join(map(str, shape))}"
 
 
-def _failures(failed: Sequence[StagedEpisode], asked: int) -> str:
-    if not failed:
-        return f"All {asked} requested seeds were solved."
-    lines = [f"- {e.info['task_name']}, seed {e.info['seed']}: {e.failure}" for e in failed]
-    return f"**{len(failed)} of {asked} requested seeds have no demonstration:**\n\n" + "\n".join(lines)
-
-
-# --- the licence ---
-
-
-def terms(infos: Iterable[Mapping[str, Any]]) -> tuple[str, bool, list[str]]:
-    """Return a dataset's licence, as the hub names it, and its reasons.
-
-    Args:
-        infos: information on its episodes (`staging.episode_info`).
-
-    Returns:
-        The licence, whether scenes are LIBERO's, and the parts that are of MEMOBench's authors.
-    """
-    infos = list(infos)
-    there = [info for info in infos if info.get(WORLD) == LIBERO]
-    theirs = {
-        "The demonstrations": any(info["seed"] < 0 for info in infos),  # converted: `memobench generate` knows the seed
-        "The scanned objects": any(map(_shows_scans, there)),
+def parts_of_authors(records: Sequence[DemonstrationRecord]) -> list[str]:
+    """Return the parts of a dataset that are of MEMOBench's authors, which decide its licence."""
+    parts = {
+        "The demonstrations": any(record.seed < 0 for record in records),  # converted: `generate` knows the seed
+        "The scanned objects": any(map(_shows_scans, records)),
     }
-    parts = [part for part, shown in theirs.items() if shown]
-    return "cc-by-nc-4.0" if parts else "other" if there else "apache-2.0", bool(there), parts
+    return [part for part, shown in parts.items() if shown]
 
 
-def _shows_scans(info: Mapping[str, Any]) -> bool:
+def _shows_scans(record: DemonstrationRecord) -> bool:
     """Return whether an episode's scene has a scan: each object of a spatial task is one or a stand-in."""
-    name = info["task_name"]
-    if info["memory_type"] != "spatial" or suite_of(name) is None:
+    if record.memory_type != "spatial" or suite_of(record.task_name) is None:
         return False
-    return not set(get_task(name).objects.values()) <= set(info.get("stand_ins") or ())
+    return not {*get_task(record.task_name).objects.values()} <= {*record.stand_ins}
 
 
-# --- statistics, and the paper's ---
+def _statistics(table: pd.DataFrame) -> dict[str, Any]:
+    """Return the statistics of episodes, with the keys of `FAMILIES`."""
+    return {
+        "tasks": table.task_name.nunique(),
+        "episodes": len(table),
+        "steps": table.frames.sum(),
+        "mean": table.frames.mean(),
+        "median": table.frames.median(),
+        "p95": np.percentile(table.frames, 95),
+        "max": table.frames.max(),
+    }
 
 
-def _prompts(infos: Sequence[dict[str, Any]]) -> list[str]:
-    """Return the mean length of prompts for each memory type that has some."""
-    parts = []
-    for name in ordered_types(infos):
-        lengths = [info["exec_start_index"] for info in infos if info["memory_type"] == name]
-        if any(lengths):
-            parts.append(f"{np.mean(lengths):.1f} in {name} tasks")
-    return parts
-
-
-def _size(folder: Path) -> int:
-    """Return the bytes of a dataset, without its card and manifest."""
-    kept = [folder / part for part in ("data", "meta", "states", "videos")]
-    return sum(path.stat().st_size for part in kept for path in files_below(part))
-
-
-def ordered_types(infos: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the distinct memory types of episodes: the paper's in its order, then others."""
-    there = {info["memory_type"] for info in infos}
-    return [name for name in FAMILIES if name in there] + sorted(there - set(FAMILIES))
-
-
-def _lengths_table(infos: Sequence[dict[str, Any]]) -> str:
-    """Return episodes and steps per memory type, and the paper's."""
+def _lengths_table(table: pd.DataFrame, types: Sequence[str]) -> str:
     rows = []
-    for name in [*ordered_types(infos), "total"]:
-        rows.append([name, "here", *_lengths(_figures([i for i in infos if name in (i["memory_type"], "total")]))])
+    for name in [*types, "total"]:
+        part = table if name == "total" else table[table.memory_type == name]
+        rows.append([name, "here", *_lengths(_statistics(part))])
         if name in FAMILIES:
             rows.append(["", "paper", *_lengths(FAMILIES[name])])
     return markdown(["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max"], rows)
-
-
-def _figures(infos: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the statistics of episodes, with the keys of `FAMILIES`."""
-    lengths = np.array([info["frames"] for info in infos])
-    return {
-        "tasks": len({info["task_name"] for info in infos}),
-        "episodes": len(infos),
-        "steps": lengths.sum(),
-        "mean": lengths.mean(),
-        "median": np.median(lengths),
-        "p95": np.percentile(lengths, 95),
-        "max": lengths.max(),
-    }
 
 
 def _lengths(row: Mapping[str, Any]) -> list[str]:
@@ -280,8 +234,7 @@ def _lengths(row: Mapping[str, Any]) -> list[str]:
     return [*(f"{row[key]:,}" for key in whole), *(f"{row[key]:,.2f}" for key in parts), f"{row['max']:,}"]
 
 
-def _buckets_table(infos: Sequence[dict[str, Any]]) -> str:
-    lengths = np.array([info["frames"] for info in infos])
+def _buckets_table(lengths: pd.Series[int]) -> str:
     published = sum(LENGTH_BUCKETS.values())
     rows = []
     for (low, high), theirs in LENGTH_BUCKETS.items():
@@ -292,14 +245,13 @@ def _buckets_table(infos: Sequence[dict[str, Any]]) -> str:
     return markdown(["length", "episodes here", "share", "episodes in the paper", "share"], rows)
 
 
-def _tasks_table(infos: Sequence[dict[str, Any]], failed: Sequence[StagedEpisode]) -> str:
+def _tasks_table(table: pd.DataFrame, failed: Sequence[StagedEpisode]) -> str:
     rows = []
-    for name in sorted({info["task_name"] for info in infos} | {e.info["task_name"] for e in failed}):
-        chosen = [info for info in infos if info["task_name"] == name]
-        seeds = [str(e.info["seed"]) for e in failed if e.info["task_name"] == name]
-        mean = f"{np.mean([info['frames'] for info in chosen]):.1f}" if chosen else ""
-        operations = chosen[0]["operations"] if chosen else ""
-        rows.append([name, operations, f"{len(chosen)}/{len(chosen) + len(seeds)}", mean, ", ".join(seeds)])
+    for name in sorted({*table.task_name} | {episode.info["task_name"] for episode in failed}):
+        part = table[table.task_name == name]
+        seeds = [str(episode.info["seed"]) for episode in failed if episode.info["task_name"] == name]
+        operations, mean = (part.operations.iloc[0], f"{part.frames.mean():.1f}") if len(part) else ("", "")
+        rows.append([name, operations, f"{len(part)}/{len(part) + len(seeds)}", mean, ", ".join(seeds)])
     return markdown(["task", "operations", "solved", "mean frames", "failing seeds"], rows)
 
 
@@ -307,19 +259,6 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
     """Return a table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
-
-
-TABLES_FILE = "tables.md"
-UNCHECKED = (
-    "not checked: values of tables, frames of videos, statistics, states, hashes, HDF5 files and feature caches; "
-    "`memobench validate {folder}` checks them"
-)
-UPLOADED = (MANIFEST_FILE, "data/**", "meta/**", "states/**", "videos/**")
-"""Uploaded files besides the card; others, such as feature caches, are not uploaded."""
-REPLACED = (*UPLOADED, "hdf5/**", "feature_cache/**")
-"""Files of an earlier dataset on the hub that an upload deletes, because LeRobot would load its frames too."""
-
-Notify = Callable[[str], None]
 
 
 # --- describe ---
@@ -336,69 +275,62 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
             episodes is one of this benchmark.
     """
     with undamaged(folder):
-        places = list_episodes(folder)
-    rows = records_of(folder, places)
-    strangers = [str(place.index) for place in places if place.record is None]
+        episodes = list_episodes(folder)
+    described = described_of(folder, episodes)
+    strangers = [str(episode.index) for episode in episodes if episode.record is None]
     if strangers:
-        listed = ", ".join(strangers[:5]) + (", …" if len(strangers) > 5 else "")
-        notify(f"{len(strangers)} of {len(places)} episodes ({listed}) are left out: {STRANGER}")
+        numbers = ", ".join(strangers[:5]) + (", …" if len(strangers) > 5 else "")
+        notify(f"{len(strangers)} of {len(episodes)} episodes ({numbers}) are left out: {STRANGER}")
     check_whole(folder)
     with undamaged(folder), naming_damage(folder):
-        card = own_card(folder, read_info(folder)["total_episodes"])
-        tables = card_tables(card or card_from_frames(folder, rows))
-        manifest = read_manifest(folder) if (folder / MANIFEST_FILE).is_file() else _manifest_of(rows)
-    notify(UNCHECKED.format(folder=folder))
+        card = own_card(folder, len(episodes))
+        text = card or card_from_frames(folder, described)
+        manifest = read_manifest(folder) if (folder / MANIFEST_FILE).is_file() else _manifest_of(described)
+    notify(
+        "not checked: values of tables, frames of videos, statistics, states, hashes, HDF5 files and feature caches; "
+        f"`memobench validate {folder}` checks them"
+    )
     if card is None:
         notify(EDITED)
-        _put_card(folder, rows, notify)
+        if not (folder / CARD_FILE).exists():
+            try:
+                write_file(folder / CARD_FILE, text)
+            except OSError as error:
+                notify(f"its card could not be written to {folder} ({error.strerror})")
+    tables = MADE_BY + text.partition(MADE_BY)[2].partition("## Columns")[0].rstrip() + "\n"
     with explaining_disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         return [
             write_file(out / TABLES_FILE, tables),
-            write_file(out / MANIFEST_FILE, short_manifest(manifest)),
+            write_file(out / MANIFEST_FILE, _short_manifest(manifest)),
         ]
 
 
-def _put_card(folder: Path, rows: Sequence[Mapping[str, Any]], notify: Notify) -> None:
-    """Write a card for a dataset without one, if the folder is writable."""
-    if (folder / CARD_FILE).exists():
-        return
-    try:
-        write_file(folder / CARD_FILE, card_from_frames(folder, rows))
-    except OSError as error:
-        notify(f"its card could not be written to {folder} ({error.strerror})")
-
-
-def _manifest_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:
     """Return a manifest of existing episodes."""
-    versions = sorted({json.dumps(row["versions"], sort_keys=True) for row in rows if row["versions"]})
+    versions = sorted({json.dumps(record.versions, sort_keys=True) for record, _ in episodes if record.versions})
     return {
         "versions": [json.loads(each) for each in versions],
-        "episodes": [{**row, "failure": None} for row in rows],
+        "episodes": [{**record.model_dump(), "failure": None} for record, _ in episodes],
     }
 
 
-def card_tables(card: str) -> str:
-    """Return the sections of a dataset card from its making to its statistics."""
-    begin, end = card.find(MADE_BY), card.find("## Columns")
-    if begin < 0:
-        raise MemobenchError("the dataset's README.md has no section 'How it was made': another program wrote it")
-    return card[begin : end if end > begin else None].rstrip() + "\n"
-
-
-def short_manifest(manifest: Mapping[str, Any]) -> str:
+def _short_manifest(manifest: Mapping[str, Any]) -> str:
     """Return a manifest as JSON with one line per task: seed to the episode's hash, or to the reason of its failure."""
     tasks: dict[str, dict[str, str]] = {}
     for row in manifest["episodes"]:
-        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = (
-            row["failure"] or row.get("digest") or "no hash was stored"
-        )
+        tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"]
     head = {key: value for key, value in manifest.items() if key != "episodes"}
     lines = [f"{json.dumps(name)}: {json.dumps(seeds)}" for name, seeds in sorted(tasks.items())]
     return json.dumps(head | {"tasks": None})[: -len("null}")] + "{\n" + ",\n".join(lines) + "\n}}\n"
 
 
 # --- push ---
+
+UPLOADED = (MANIFEST_FILE, "data/**", "meta/**", "states/**", "videos/**")
+"""Uploaded files besides the card; others, such as feature caches, are not uploaded."""
+REPLACED = (*UPLOADED, "hdf5/**", "feature_cache/**")
+"""Files of an earlier dataset on the hub that an upload deletes, because LeRobot would load its frames too."""
 
 
 def push(
@@ -411,12 +343,10 @@ def push(
 ) -> str:
     """Upload a finished dataset, so that ``LeRobotDataset("<user>/memobench")`` loads it; return its address.
 
-    The repository then holds this dataset and no file of an earlier one, which remains in its history. The card shows
-    how to load it from the hub. The same call continues an interrupted upload: huggingface_hub skips files whose hash
-    the hub has already.
+    The repository then holds this dataset and no file of an earlier one, which remains in its history. The same call
+    continues an interrupted upload: huggingface_hub skips files whose hash the hub has already.
 
     Args:
-        folder: the dataset.
         repo_id: ``user/name`` on the hub; created if necessary.
         token: token with write access; by default the one of ``hf auth login`` or HF_TOKEN.
         private: whether a created repository is private; None uses the account's setting.
@@ -463,28 +393,25 @@ def push(
 
 @contextlib.contextmanager
 def _hub_errors(repo_id: str) -> Iterator[None]:
-    """Turn an error of the hub or the connection into a `MemobenchError` with a fix."""
     import httpx
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError
 
     try:
         yield
-    except HFValidationError as error:
-        raise MemobenchError(f"the hub does not allow the repository name {repo_id!r}: {_line(error)}") from None
-    except HfHubHTTPError as error:
-        status = error.response.status_code if error.response is not None else None
-        if status in (401, 403):
-            raise MemobenchError(
+    except (HFValidationError, HfHubHTTPError, httpx.TransportError, OSError) as error:
+        line = " ".join(str(error).split())
+        status = getattr(getattr(error, "response", None), "status_code", None)
+        if isinstance(error, HFValidationError):
+            reason = f"the hub does not allow the repository name {repo_id!r}: {line}"
+        elif status in (401, 403):
+            reason = (
                 f"the hub refused to write to {repo_id} ({status}): the token is not valid or has no write access; "
                 "pass another token or name your own repository"
-            ) from None
-        raise MemobenchError(f"the hub answered {_line(error)[:300]}; repeat the command to continue") from None
-    except (httpx.TransportError, OSError) as error:
-        raise MemobenchError(
-            f"the hub could not be reached ({type(error).__name__}: {_line(error)[:200]}); repeat the command to "
-            "continue"
-        ) from None
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+            )
+        elif isinstance(error, HfHubHTTPError):
+            reason = f"the hub answered {line[:300]}; repeat the command to continue"
+        else:
+            reason = (
+                f"the hub could not be reached ({type(error).__name__}: {line[:200]}); repeat the command to continue"
+            )
+        raise MemobenchError(reason) from None

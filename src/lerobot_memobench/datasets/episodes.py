@@ -8,19 +8,19 @@ from __future__ import annotations
 import json
 import shlex
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from operator import index
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict
 
 import numpy as np
 from annotated_types import Ge, Le
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, Demonstration, digest, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
 from lerobot_memobench.datasets.layout import (
     ADVICE,
     EPISODE_INFO,
@@ -47,9 +47,7 @@ from lerobot_memobench.io import (
     short,
 )
 from lerobot_memobench.protocol import CONTROL_HZ
-from lerobot_memobench.sim.scene_hash import LIBERO
-from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.tasks.catalogue import suite_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,22 +73,22 @@ class Info(TypedDict):
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """Return ``meta/info.json`` of the dataset in ``folder``.
+    """Return ``meta/info.json``.
 
     Raises:
-        MemobenchError: there is none, it is damaged, or of an earlier format.
+        MemobenchError: there is none, it is damaged, or of another format of LeRobot.
     """
     try:
-        found: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
+        info: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(f"{folder} is no dataset (there is no {INFO_FILE}); name one that was generated") from None
-    if not found["codebase_version"].startswith("v3."):
+    if not info["codebase_version"].startswith("v3."):
         raise MemobenchError(
-            f"{folder} is in LeRobot's format {found['codebase_version']}, expected v3.0; convert it in place, from "
+            f"{folder} is in LeRobot's format {info['codebase_version']}, expected v3.0; convert it in place, from "
             f"v2.1: python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/converted "
             f"--root={shlex.quote(str(folder))} --push-to-hub=false"
         )
-    return found
+    return info
 
 
 def tables_of(
@@ -165,18 +163,15 @@ DETERMINED = {
 
 
 class DemonstrationRecord(BaseModel):
-    """Fields of an episode as a whole: its task, seed, placement, hashes.
+    """The facts of an episode as a whole: its task, seed, placement and hashes.
 
     A dataset stores it twice: in ``meta/episodes``, which ``LeRobotDataset(…, episode_filter=…)`` reads, and as JSON in
     the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
-    keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files.
-
-    A field's description is its meaning in the dataset card.
+    keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files. Manifest and dataset
+    card are made of it; a field's description is its meaning in the card.
 
     Attributes:
         seed: -1 if unknown.
-        digest: None in datasets of earlier versions.
-        world: ``libero``; None for the scenes that version 0.2 modelled in code, as for stand_ins.
         stand_ins: classes whose missing scans this package's objects replaced.
         versions: versions of the packages on which the numbers depend; None if unknown.
     """
@@ -185,25 +180,22 @@ class DemonstrationRecord(BaseModel):
 
     task_name: str = Field(description="task of the catalogue")
     memory_type: str = Field(description="temporal, spatial, object or procedural")
-    family: str = Field("", description="group of similar tasks")
-    operations: str = Field("", description="labels of the checkpoints in order, e.g. SUC")
+    family: str = Field(description="group of similar tasks")
+    operations: str = Field(description="labels of the checkpoints in order, e.g. SUC")
     seed: Whole = Field(description="seed of the scene")
     referent: str = Field(
-        "fixed",
         description="fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it "
         "(strict tasks)",
     )
     variant: Count = Field(description="number of the referent or order; 0 is the published one")
-    success: bool | None = Field(None, description="the goal was reached")
+    success: bool = Field(description="the goal was reached")
     exec_start_index: Count = Field(description="first frame of the execution")
     key_frames: list[Whole] = Field(description="frame at which each checkpoint was completed in order, −1 if never")
-    scene_hash: str | None = Field(None, description="hash of the initial scene")
-    fixture_poses: dict[str, list[Number]] | None = Field(
-        None, description="JSON, fixture to position and quaternion wxyz"
-    )
-    digest: str | None = Field(None, description="sha256 of states, actions and labels")
-    world: str | None = None
-    stand_ins: list[str] | None = None
+    scene_hash: str = Field(description="hash of the initial scene")
+    fixture_poses: dict[str, list[Number]] = Field(description="JSON, fixture to position and quaternion wxyz")
+    digest: str = Field(description="sha256 of states, actions and labels")
+    world: Literal["libero"]
+    stand_ins: list[str]
     versions: dict[str, str] | None = None
 
     @classmethod
@@ -228,7 +220,7 @@ class DemonstrationRecord(BaseModel):
             scene_hash=demo.scene_hash,
             fixture_poses={name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
             digest=digest(demo),
-            world=LIBERO,
+            world="libero",
             stand_ins=list(demo.stand_ins),
         )
 
@@ -242,20 +234,15 @@ class DemonstrationRecord(BaseModel):
 
     def in_meta(self) -> dict[str, Any]:
         """Return the columns of ``meta/episodes``."""
-        elsewhere = {} if self.world is None else {"world": self.world, "stand_ins": json.dumps(self.stand_ins or [])}
-        return self.model_dump(exclude={"versions", "world", "stand_ins"}) | {
+        return self.model_dump(exclude={"versions"}) | {
             "key_frames": np.array(self.key_frames, dtype=np.int64),
             "fixture_poses": json.dumps(self.fixture_poses),
-            **elsewhere,
+            "stand_ins": json.dumps(self.stand_ins),
         }
 
 
 def from_frames(text: str, where: str) -> DemonstrationRecord:
-    """Return the record in the text of an episode's first frame.
-
-    Args:
-        text: JSON.
-        where: dataset and episode, for the message.
+    """Return the record in the text of an episode's first frame; ``where`` names dataset and episode in errors.
 
     Raises:
         MemobenchError: the text is no record.
@@ -272,33 +259,30 @@ def from_frames(text: str, where: str) -> DemonstrationRecord:
 
 def from_meta(row: Mapping[str, Any]) -> DemonstrationRecord | None:
     """Return the record in a row of ``meta/episodes``; None if it is missing or incomplete."""
-    values = {key: row[key] for key in DemonstrationRecord.model_fields if row.get(key) is not None}
     try:
-        in_json = {key: json.loads(values.get(key, "null")) for key in ("fixture_poses", "stand_ins")}
-        return DemonstrationRecord.model_validate(values | in_json)
-    except (ValidationError, ValueError, TypeError):
+        in_json = {key: json.loads(row[key]) for key in ("fixture_poses", "stand_ins")}
+        return DemonstrationRecord.model_validate({**row, **in_json})
+    except (KeyError, ValueError, TypeError):
         return None
 
 
-class Asked(TypedDict):
-    """A requested episode."""
+class EpisodeRequest(TypedDict):
+    """A requested episode, and the reason why it could not be made."""
 
     task_name: str
     seed: Whole
-    digest: NotRequired[str | None]
+    failure: str
 
 
-class Made(Asked):
+class EpisodeEntry(TypedDict):
     """An episode of the dataset."""
 
+    task_name: str
+    seed: Whole
     failure: None
+    episode_index: Count
     frames: Count
-
-
-class Failed(Asked):
-    """An episode that could not be made, and the reason."""
-
-    failure: str
+    digest: str
 
 
 class ConversionNote(BaseModel):
@@ -326,9 +310,9 @@ class FileHash(TypedDict):
 
 
 class Manifest(TypedDict):
-    """``manifest.json``: the request of a run, and the hash of every episode and file."""
+    """``manifest.json``: the request of a run, and the hashes of its episodes and files."""
 
-    episodes: list[Made | Failed]
+    episodes: list[EpisodeEntry | EpisodeRequest]
     request: NotRequired[dict[str, Any]]
     left_out: NotRequired[list[ConversionNote]]
     notes: NotRequired[list[ConversionNote]]
@@ -343,38 +327,34 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         MemobenchError: it is none of this package's.
     """
     advice = "this package did not write it like that; take the dataset from its source again"
-    found: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, advice)
-    return found
+    manifest: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, advice)
+    return manifest
 
 
 Columns = dict[str, Any]
 STRANGER = (
-    "it has neither task nor seed: another program made it, or LeRobot's tools edited a dataset of an earlier version, "
-    f"without the column {EPISODE_INFO}, and dropped the fields of meta/episodes; generate it again"
+    "it has neither task nor seed: another program made it, or LeRobot's tools edited a dataset without the column "
+    f"{EPISODE_INFO} and dropped the fields of meta/episodes; generate it again"
 )
 """Message for an episode without a record."""
 
 
 @dataclass(frozen=True)
-class EpisodePlace:
-    """An episode in a dataset.
+class ListedEpisode:
+    """An episode of a dataset, without its frames.
 
     Attributes:
-        index: number in the dataset.
         start: first frame in the dataset's global index.
-        length: number of frames.
         record: None if this package wrote none.
-        instructions: distinct instructions of its frames.
     """
 
     index: int
     start: int
     length: int
     record: DemonstrationRecord | None
-    instructions: tuple[str, ...] = ()
 
 
-def list_episodes(folder: Path) -> list[EpisodePlace]:
+def list_episodes(folder: Path) -> list[ListedEpisode]:
     """Return a dataset's episodes with their records, in order.
 
     Raises:
@@ -385,7 +365,7 @@ def list_episodes(folder: Path) -> list[EpisodePlace]:
     own = ("episode_index", EPISODE_INFO)
     first = read_table(folder / "data", own.__contains__, [("frame_index", "==", 0)]).to_pylist()
     texts = {int(row["episode_index"]): row.get(EPISODE_INFO) for row in first}
-    return [_place(folder, row, texts.get(row["episode_index"])) for row in rows]
+    return [_listed(folder, row, texts.get(row["episode_index"])) for row in rows]
 
 
 def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
@@ -402,12 +382,12 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
         raise MemobenchError(
             f"{unknown[0]!r} is no field of an episode; expected one of {', '.join(DemonstrationRecord.model_fields)}"
         )
-    records = {place.index: place.record for place in list_episodes(Path(folder)) if place.record is not None}
-    found = [n for n, record in records.items() if all(getattr(record, k) == v for k, v in wanted.items())]
-    if not found:
-        asked = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
-        raise MemobenchError(f"{folder} has no episode with {asked}; `memobench describe {folder}` lists them")
-    return found
+    records = {episode.index: episode.record for episode in list_episodes(Path(folder)) if episode.record is not None}
+    numbers = [n for n, record in records.items() if all(getattr(record, k) == v for k, v in wanted.items())]
+    if not numbers:
+        fields = ", ".join(f"{key}={value!r}" for key, value in wanted.items())
+        raise MemobenchError(f"{folder} has no episode with {fields}; `memobench describe {folder}` lists them")
+    return numbers
 
 
 def check_suite_of(folder: Path, suite: str) -> None:
@@ -416,42 +396,18 @@ def check_suite_of(folder: Path, suite: str) -> None:
     Raises:
         MemobenchError: naming the first such task.
     """
-    for place in list_episodes(folder) if is_dataset(folder) else ():
-        name = place.record.task_name if place.record is not None else ""
-        found = suite_of(name)
-        if found not in (None, suite):
+    for episode in list_episodes(folder) if is_dataset(folder) else ():
+        name = episode.record.task_name if episode.record is not None else ""
+        own = suite_of(name)
+        if own not in (None, suite):
             raise MemobenchError(
-                f"{folder} holds demonstrations of {name!r}, a task of the {found} suite; use --suite {found}"
-            )
-
-
-def check_revision(folder: Path, places: Iterable[EpisodePlace] | None = None) -> None:
-    """Refuse a LeRobotDataset with strict demonstrations of earlier versions: of other goals, prompts or holds.
-
-    Args:
-        places: its episodes; read from the folder by default.
-
-    Raises:
-        MemobenchError: naming the first such episode.
-    """
-    has_holds = HELD_COLUMN in read_info(folder)["features"]
-    for place in list_episodes(folder) if places is None else places:
-        record = place.record
-        if record is None or record.seed < 0 or suite_of(record.task_name) != STRICT:
-            continue
-        task = get_task(record.task_name).variant(record.variant)
-        same_goal = not place.instructions or task.language in place.instructions
-        if not (same_goal and has_holds and record.exec_start_index in (task.prompt_steps or 0, 0)):
-            raise MemobenchError(
-                f"episode {place.index} of {folder} ({record.task_name}, seed {record.seed}) was made by an earlier "
-                "version, whose strict tasks have another instruction, another length of the prompt or no held "
-                "frames; generate the demonstrations again"
+                f"{folder} holds demonstrations of {name!r}, a task of the {own} suite; use --suite {own}"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedEpisode:
-    """An episode of a dataset on disk.
+    """An episode of a dataset with its frames.
 
     Attributes:
         columns: values per frame; the column ``task`` is the instruction.
@@ -478,12 +434,12 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
         raise MemobenchError(f"{root} has no episode {episode_index}; see total_episodes in its meta/info.json")
     columns = _read_columns(root, episode_index)
     texts = columns.pop(EPISODE_INFO, [None])
-    place = _place(root, rows[0], texts[0])
-    record = place.record
+    episode = _listed(root, rows[0], texts[0])
+    record = episode.record
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    whole = {key: value for key, value in record.determined().items() if value not in (None, "")}
+    whole = {key: value for key, value in record.determined().items() if value != ""}
     if LANGUAGE in columns:
         whole[LANGUAGE] = columns[LANGUAGE][0]
         changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
@@ -491,7 +447,7 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
             raise MemobenchError(
                 f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
             )
-    return RecordedEpisode(record, columns, whole, place.start)
+    return RecordedEpisode(record, columns, whole, episode.start)
 
 
 def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[str | None], length: int) -> None:
@@ -512,26 +468,23 @@ def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[
 
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
     """Return the rows of meta/episodes, or that of one episode, in order and without statistics."""
-    own = ("episode_index", "length", "dataset_from_index", "tasks", *DemonstrationRecord.model_fields)
+    own = ("episode_index", "length", "dataset_from_index", *DemonstrationRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
     return read_table(folder / EPISODES, own.__contains__, chosen).sort_by("episode_index").to_pylist()
 
 
-def _place(folder: Path, row: dict[str, Any], text: str | None) -> EpisodePlace:
+def _listed(folder: Path, row: dict[str, Any], text: str | None) -> ListedEpisode:
     number = int(row["episode_index"])
     record = from_frames(text, f"{folder}, episode {number}") if text else from_meta(row)
-    instructions = tuple(row.get("tasks") or ())
-    return EpisodePlace(number, int(row["dataset_from_index"]), int(row["length"]), record, instructions)
+    return ListedEpisode(number, int(row["dataset_from_index"]), int(row["length"]), record)
 
 
 def _read_columns(root: Path, episode_index: int) -> Columns:
-    """Return the columns of an episode's frames, its instructions as ``task``, and, if stored, its states."""
     chosen = [("episode_index", "==", episode_index)]
     table = read_table(root / "data", rows=chosen).sort_by("frame_index")
     columns: Columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
-        values = np.array(numbers(column)) if is_numeric(column.type) else column.to_pylist()
-        columns[EARLIER_COLUMNS.get(name, name)] = values
+        columns[name] = np.array(numbers(column)) if is_numeric(column.type) else column.to_pylist()
     tasks = read_tasks(root)
     names = {index(number): str(text) for text, number in zip(tasks.index, tasks["task_index"].tolist(), strict=True)}
     columns["task"] = [names.get(int(number), "") for number in columns.pop("task_index")]

@@ -17,9 +17,8 @@ from lerobot_memobench.datasets.demonstration import (
     MAX_CHECKPOINTS,
     MEMORY_COLUMN,
 )
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, files_below
-from lerobot_memobench.protocol import CAMERAS, CLOCK, OBS_PHASE, OBS_STEP
+from lerobot_memobench.protocol import CAMERAS, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.sim.object_layout import NAMES
 
@@ -180,22 +179,5 @@ def image_key(camera: str) -> str:
 
 
 def objects_column(names: Collection[str]) -> str:
-    """Return the column of objects among ``names``; datasets with images of earlier versions use LeRobot's name."""
+    """Return the column of objects among ``names``: `PRIVILEGED`, or without images `OBJECTS`."""
     return PRIVILEGED if PRIVILEGED in names else OBJECTS
-
-
-def check_clock(names: Collection[str], where: Path | str) -> None:
-    """Refuse a dataset of an earlier version, whose prompts would be read as execution.
-
-    Args:
-        names: its columns.
-        where: its folder.
-
-    Raises:
-        MemobenchError: it has the column ``phase`` of that version instead of the present ones.
-    """
-    if {"phase", "simple_subgoal"} <= set(names) and not set(CLOCK) <= set(names):
-        raise MemobenchError(
-            f"{where} was made by an earlier version: it has the column phase instead of {' and '.join(CLOCK)}; "
-            "generate or convert it again"
-        )

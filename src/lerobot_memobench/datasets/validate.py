@@ -22,10 +22,8 @@ from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration,
 from lerobot_memobench.datasets.episodes import (
     Columns,
     DemonstrationRecord,
-    EpisodePlace,
     FileHash,
     RecordedEpisode,
-    check_revision,
     check_whole,
     expect,
     list_episodes,
@@ -44,7 +42,6 @@ from lerobot_memobench.datasets.layout import (
     MANIFEST_FILE,
     OBJECTS,
     STATS_FILE,
-    check_clock,
     dataset_files,
     image_key,
     is_dataset,
@@ -60,7 +57,6 @@ from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
@@ -69,8 +65,8 @@ from lerobot_memobench.tasks.task import STRICT, Task
 COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
 """Fields of an episode in the manifest that its record has too."""
 NO_HASHES = (
-    "it has no hashes of files, as in datasets of earlier versions and after LeRobot's dataset tools: damage to a "
-    "frame that can still be decoded and is not drawn again cannot be found"
+    "it has no hashes of files, as after LeRobot's dataset tools: damage to a frame that can still be decoded and is "
+    "not drawn again cannot be found"
 )
 
 
@@ -223,11 +219,6 @@ def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Che
             f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
             "by `memobench convert`"
         )
-    check_clock(read_info(folder)["features"], folder)
-    places: Sequence[EpisodePlace] = ()
-    with contextlib.suppress(MemobenchError):  # the check of each episode reports a damaged file
-        places = list_episodes(folder)
-    check_revision(folder, places)
     count = episode_count(folder)
     return [_Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k, tasks)) for k in range(count)]
 
@@ -327,13 +318,13 @@ def check_manifest(folder: Path) -> None:
     Raises:
         MemobenchError: naming the first episode and field that differ.
     """
-    rows = {row.get("episode_index"): row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
-    for place in list_episodes(folder) if None not in rows else ():  # a manifest of an earlier version
-        row = rows.pop(place.index, {})
-        held = {key: getattr(place.record, key) for key in COMPARED} if place.record is not None else {}
-        for key, value in {"frames": place.length, **held}.items():
-            if row.get(key) != value and value is not None:
-                raise MemobenchError(f"episode {place.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
+    rows = {row["episode_index"]: row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
+    for episode in list_episodes(folder):
+        row, record = rows.pop(episode.index, {}), episode.record
+        facts = {"frames": episode.length} | ({} if record is None else record.model_dump(include={*COMPARED}))
+        for key, value in facts.items():
+            if row.get(key) != value:
+                raise MemobenchError(f"episode {episode.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
     if rows:
         raise MemobenchError(f"it names episode {next(iter(rows))}, which is not in the dataset")
 
@@ -389,7 +380,6 @@ def replay(
         columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
     else:
         record, start = recorded.record, recorded.start
-        check_world(record.world, "the episode")
         task = (task or get_task(record.task_name)).variant(record.variant)
         columns, whole = recorded.columns, recorded.whole
         if "action" not in columns:
