@@ -29,7 +29,7 @@ from lerobot_memobench.datasets.validate import CheckResult, images_of, replay, 
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
-from tests.datasets.conftest import FRAMES
+from tests.datasets.conftest import FRAMES, as_recorded
 from tests.support.short_demonstrations import drawn_steps
 from tests.support.videos import encode_video
 
@@ -186,10 +186,10 @@ def test_verdicts_of_episodes_and_files(tmp_path, stove):
 def test_replay_compares_fields_of_the_episode(stove, simulated, tmp_path):
     satisfied = stove.satisfied.copy()
     satisfied[5] = True
-    found = replay(replace(stove, satisfied=satisfied))
+    found = replay(as_recorded(replace(stove, satisfied=satisfied)))
     assert (found.column, found.frame) == ("checkpoint.completed", 5)
-    assert str(replay(replace(stove, success=False))) == "success: recorded False, replayed True"
-    assert replay(replace(stove, seed=10_001)).column == "states"
+    assert str(replay(as_recorded(replace(stove, success=False)))) == "success: recorded False, replayed True"
+    assert replay(as_recorded(replace(stove, seed=10_001))).column == "states"
     episode = read_episode(simulated, 0)
     assert replay(replace(episode, whole={**episode.whole, "key_frames": [1, 2]})).column == "key_frames"
     columns = {key: value for key, value in episode.columns.items() if key != "states"}

@@ -98,19 +98,14 @@ def generate(
             notify=partial(screen.print, soft_wrap=True),
             **named,
         )
-    _print_summary(summary)
-    return summary.exit_status
-
-
-def _print_summary(summary: GenerationSummary) -> None:
-    """Print the outcome of every seed and the place of the dataset."""
     console().print(Unbroken(_summary_table(summary)), crop=False)
-    for failure in summary.failures:
-        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
+    for episode in summary.failures:
+        say(f"no demonstration of {episode.task_name}, seed {episode.seed}: {episode.failure}")
     if summary.folder is None:
         say("no dataset was written: no seed was solved")
     else:
         say(f"dataset: {summary.folder}")
+    return 1 if summary.failures else 0
 
 
 def _summary_table(summary: GenerationSummary) -> Table:
@@ -118,9 +113,11 @@ def _summary_table(summary: GenerationSummary) -> Table:
     table.add_column("task")
     for name in ("solved", "of", "frames", "mean length"):
         table.add_column(name, justify="right")
-    for task in summary.tasks:
-        mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
-        table.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
+    for name in summary.tasks:
+        episodes = [episode for episode in summary.episodes if episode.task_name == name]
+        frames = [episode.frames for episode in episodes if episode.failure is None]
+        mean = f"{sum(frames) / len(frames):.0f}" if frames else "–"
+        table.add_row(name, str(len(frames)), str(len(episodes)), str(sum(frames)), mean)
     return table
 
 
@@ -252,24 +249,23 @@ def validate(
     The first disagreement of each is reported, and files that were written again.
     """
     from lerobot_memobench.datasets.episodes import check_suite_of
-    from lerobot_memobench.datasets.validate import exit_status
     from lerobot_memobench.datasets.validate import validate as run
 
     if suite is not None:
         check_suite_of(folder, suite)
     with counting(console(), "episodes") as count:
 
-        def advance(done: int, total: int, verdict: CheckResult) -> None:
-            count(done, total, verdict.subject, trouble=verdict.disagreement)
+        def advance(done: int, total: int, result: CheckResult) -> None:
+            count(done, total, result.subject, trouble=result.disagreement)
 
-        verdicts = run(folder, workers=workers, progress=advance)
-    for verdict in verdicts:
-        if verdict.note is not None:
-            say(f"note: {verdict.subject}: {verdict.note}")
-    episodes, files = ([each for each in verdicts if each.of_file == of_file] for of_file in (False, True))
-    agree, damaged = (sum(each.disagreement is None for each in episodes), exit_status(files))
-    say(f"{agree} of {len(episodes)} episodes agree" + damaged * ", and files of the dataset do not (above)")
-    return exit_status(verdicts)
+        results = run(folder, workers=workers, progress=advance)
+    for result in results:
+        if result.note is not None:
+            say(f"note: {result.subject}: {result.note}")
+    episodes, files = ([each.disagreement for each in results if each.of_file == of_file] for of_file in (False, True))
+    damaged = ", and files of the dataset do not (above)" if any(files) else ""
+    say(f"{episodes.count(None)} of {len(episodes)} episodes agree{damaged}")
+    return 1 if any(episodes) or any(files) else 0
 
 
 def push(
