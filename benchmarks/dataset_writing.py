@@ -33,16 +33,16 @@ import numpy as np
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
-from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.datasets.hdf5 import PublishedFile
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.columns import (
+from lerobot_memobench.datasets.layout import (
     EPISODE_INFO,
     EXECUTED_ACTION,
     PRIVILEGED,
     dataset_features,
     image_key,
 )
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.published_files import write_published

@@ -63,7 +63,7 @@ PUBLIC = {
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
     "Comparison": ("evaluation.comparison", "Comparison Contrast compare"),
-    "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
+    "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
@@ -206,7 +206,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
 def spaces_page() -> str:
     """Return the page of observation and action spaces."""
     from lerobot_memobench import protocol
-    from lerobot_memobench.datasets.lerobot_format.columns import ACTION_NAMES, PROPRIO_NAMES
+    from lerobot_memobench.datasets.layout import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
     from lerobot_memobench.envs.pacing import longest
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
@@ -281,8 +281,8 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
-    from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
-    from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+    from lerobot_memobench.datasets.episodes import DemonstrationRecord
+    from lerobot_memobench.datasets.layout import MEANINGS, OBJECTS, dataset_features
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
@@ -299,7 +299,9 @@ def dataset_page() -> str:
         "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EpisodeRecord.meanings().items()]),
+        table(
+            ["column", "meaning"], [[code(name), meaning] for name, meaning in DemonstrationRecord.meanings().items()]
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 

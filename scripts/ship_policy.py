@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
+from lerobot_memobench.datasets.episodes import read_manifest
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.datasets.lerobot_format.card import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.datasets.card import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.evaluation.metrics import METRICS
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.tables import WRITERS

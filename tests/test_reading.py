@@ -11,7 +11,7 @@ from typing import Annotated, Any, NotRequired, TypedDict
 import pytest
 from pydantic import AfterValidator
 
-from lerobot_memobench.datasets.lerobot_format.record import from_frames
+from lerobot_memobench.datasets.episodes import from_frames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
 

@@ -21,7 +21,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder

@@ -18,7 +18,7 @@ from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run
 from lerobot_memobench.conformance.pytest_class import MemoryConformance
 from lerobot_memobench.conformance.streams import TASK, _episode, write_streams
 from lerobot_memobench.conformance.subject import Subject, load_subject
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories

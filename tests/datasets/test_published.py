@@ -11,8 +11,8 @@ import pytest
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.episodes import read_episode
 from lerobot_memobench.datasets.hdf5 import PublishedDemo, PublishedFile
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.restore import joints_of, restore, task_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import ObjectSlots

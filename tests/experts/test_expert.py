@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.recording import HOLD_FRAMES
+from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, final_atoms, steps_of

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.recording import RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.record import RecordingSettings, compiled_episode, record
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import plan_of
 from lerobot_memobench.experts.fixtures import close_drawer, open_drawer

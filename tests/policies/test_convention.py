@@ -99,7 +99,7 @@ def test_what_a_checkpoint_states(
 @pytest.mark.parametrize("convention", ["upright", "libero"])
 def test_the_dataset_on_this_machine_decides(tmp_path: Path, convention: str) -> None:
     """Also under LIBERO's name, and with a policy that reads one camera."""
-    from lerobot_memobench.datasets.lerobot_format.columns import dataset_features
+    from lerobot_memobench.datasets.layout import dataset_features
 
     described = dataset_features((256, 256), CONVENTIONS[convention].values())
     (tmp_path / "libero_scenes" / "meta").mkdir(parents=True)

@@ -22,8 +22,8 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.datasets.episodes import list_episodes
+from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.submission import CARD, LOG
-from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import EnvSettings

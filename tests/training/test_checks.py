@@ -10,16 +10,13 @@ from typing import Any
 import pytest
 from lerobot.configs.default import DatasetConfig, EvalConfig, JobConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.training.configuration import READ, check_settings
-from lerobot_memobench.training.data import check_dataset_version, open_datasets
+from lerobot_memobench.training.data import open_datasets
 from lerobot_memobench.training.loop import begin
-from tests.support.object_dataset import make_object_dataset
 
 
 def config(**settings: Any) -> TrainPipelineConfig:
@@ -59,17 +56,6 @@ def test_unsupported_settings_are_refused(changed: dict[str, Any], named: str) -
         setattr(asked, name, value)
     with pytest.raises(MemobenchError, match=named):
         check_settings(asked)
-
-
-def test_demonstrations_of_former_scenes_are_refused(tmp_path: Path) -> None:
-    for world in (LIBERO, None):  # version 0.2 wrote none
-        root = make_object_dataset(tmp_path / str(world), records=True, world=world)
-        meta = LeRobotDatasetMetadata("memobench/objects", root=root)
-        if world is None:
-            with pytest.raises(MemobenchError, match=r"episode 0 of .* is of the scenes that version 0\.2"):
-                check_dataset_version(meta)
-        else:
-            check_dataset_version(meta)
 
 
 def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:

@@ -19,7 +19,7 @@ import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.conformance.subject import load_subject
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS

@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import PAUSES, Evaluation
-from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.episode_log import POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError

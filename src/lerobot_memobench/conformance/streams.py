@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH

@@ -17,8 +17,8 @@ from torch.overrides import TorchFunctionMode
 
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import check_clock, objects_column
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.layout import objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
@@ -211,7 +211,6 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot_memobench.training.view import choice_for, needs_view, write_view
 
     raw = LeRobotDataset(repository, root=root)
-    check_clock(raw.meta.features, raw.root)
     if not set(CLOCK) <= set(raw.meta.features):
         raise MemobenchError(f"{raw.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -38,14 +39,6 @@ style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
 LEVEL_COLUMNS = {level: f"subgoal.{level}" for level in LEVELS}
 """Level of a checkpoint's text -> column with its text at every frame."""
 INSTRUCTION_COLUMN, MEMORY_COLUMN, HELD_COLUMN = "subgoal.instruction", "oracle_memory", "held"
-EARLIER_COLUMNS = {
-    "coarse_subgoal": LEVEL_COLUMNS["coarse"],
-    "simple_subgoal": LEVEL_COLUMNS["intermediate"],
-    "grounded_subgoal": LEVEL_COLUMNS["fine"],
-    "memory": MEMORY_COLUMN,
-}
-"""Column of datasets before version 0.3 -> its present name. Version 0.3 reads both, and the second and third are those
-of RoboMME's datasets too."""
 NOT_HASHED = ("step", "coarse_subgoal", "subtask", "held")
 """Labels that are not part of an episode's hash."""
 LanguageRow = dict[str, Any]
@@ -57,7 +50,6 @@ class Demonstration:
 
     Attributes:
         task: the performed variant of the task: ``task.variant(k)`` for ``variant`` k > 0.
-        seed: seed of the scene.
         referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
         variant: number of the requested referent or order; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
@@ -68,7 +60,6 @@ class Demonstration:
             whose actions are zeros.
         satisfied: (T, K) bool, whether the predicate of checkpoint k is true at frame t; false in the prompt.
             Predicates are evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
-        success: whether the goal was reached.
         objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         scene_hash: hash of the initial scene, or empty.
@@ -100,50 +91,42 @@ class Demonstration:
     held: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        length = len(self.states)
-        self._check("states", self.states, np.float64, (length, None))
-        self._check("actions", self.actions, np.float32, (length, ACTION_DIM))
-        self._check("proprio", self.proprio, np.float32, (length, PROPRIO_DIM))
-        self._check("satisfied", self.satisfied, np.bool_, (length, len(self.task.checkpoints)))
-        self._check("objects", self.objects, np.float32, (length, None))
-        if self.executed is not None:
-            self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
-        if self.held is not None:
-            self._check("held", self.held, np.bool_, (length,))
-        if self.images is not None:
-            for camera, frames in self.images.items():
-                self._check(f"images[{camera!r}]", frames, np.uint8, (length, None, None, 3))
-            if set(self.images) != set(CAMERAS):
-                raise MemobenchError(
-                    f"{self._where()}: images of {sorted(self.images)} given, expected {sorted(CAMERAS)} or none"
-                )
+        problem = next(self._problems(), None)
+        if problem is not None:
+            raise MemobenchError(f"demonstration of {self.task.name} with seed {self.seed}: {problem}")
+
+    def _problems(self) -> Iterator[str]:
+        length, images = len(self.states), self.images or {}
+        arrays: dict[str, tuple[NDArray | None, type, tuple[int | None, ...]]] = {
+            "states": (self.states, np.float64, (None,)),
+            "actions": (self.actions, np.float32, (ACTION_DIM,)),
+            "proprio": (self.proprio, np.float32, (PROPRIO_DIM,)),
+            "satisfied": (self.satisfied, np.bool_, (len(self.task.checkpoints),)),
+            "objects": (self.objects, np.float32, (None,)),
+            "executed": (self.executed, np.float32, (ACTION_DIM,)),
+            "held": (self.held, np.bool_, ()),
+            **{f"images[{camera!r}]": (frames, np.uint8, (None, None, 3)) for camera, frames in images.items()},
+        }
+        for name, (array, dtype, widths) in arrays.items():
+            if array is None:
+                continue
+            expected = tuple("any" if n is None else n for n in (length, *widths))
+            same_shape = array.ndim == len(expected) and all(map(lambda n, m: n in ("any", m), expected, array.shape))
+            if array.dtype != np.dtype(dtype) or not same_shape:
+                types = f"{name} has type {array.dtype} and shape {array.shape}"
+                yield f"{types}, expected {np.dtype(dtype)} and {expected}"
+        if images and set(images) != set(CAMERAS):
+            yield f"images of {sorted(images)} given, expected {sorted(CAMERAS)} or none"
         if not 0 <= self.exec_start < length:
-            raise MemobenchError(
-                f"{self._where()}: execution starts at frame {self.exec_start} of {length}; "
-                "expected one of the episode's frames"
-            )
+            yield f"execution starts at frame {self.exec_start} of {length}; expected one of the episode's frames"
         if self.satisfied[: self.exec_start].any():
-            raise MemobenchError(
-                f"{self._where()}: a checkpoint is satisfied in the demonstration prompt, before frame "
-                f"{self.exec_start}; checkpoints count from the start of execution only"
-            )
-
-    def _where(self) -> str:
-        return f"demonstration of {self.task.name} with seed {self.seed}"
-
-    def _check(self, name: str, array: NDArray, dtype: type, shape: tuple[int | None, ...]) -> None:
-        matches = len(array.shape) == len(shape) and all(
-            want is None or have == want for have, want in zip(array.shape, shape, strict=False)
-        )
-        if array.dtype != np.dtype(dtype) or not matches:
-            want = tuple("any" if n is None else n for n in shape)
-            raise MemobenchError(
-                f"{self._where()}: {name} has type {array.dtype} and shape {array.shape}, "
-                f"expected {np.dtype(dtype)} and {want}"
+            yield (
+                f"a checkpoint is satisfied in the demonstration prompt, before frame {self.exec_start}; checkpoints "
+                "count from the start of execution only"
             )
 
     def __len__(self) -> int:
-        """Return T, the number of frames, demonstration prompt included."""
+        """Return T, demonstration prompt included."""
         return len(self.states)
 
     @property
@@ -159,6 +142,8 @@ class Demonstration:
 class Labels:
     """Per-frame columns of one episode of T frames; see `columns` for their names in a dataset.
 
+    The names of the fields are part of an episode's hash.
+
     Attributes:
         phase: (T,) int64, 0 prompt, 1 execution.
         step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a strict task.
@@ -167,12 +152,10 @@ class Labels:
         operation: (T,) int64, 0 S, 1 U, 2 C of the present checkpoint, -1 after the last one.
         completed: (T, 6) bool, whether checkpoint k was satisfied at any frame up to and including t.
         event: (T,) bool, whether any checkpoint is satisfied for the first time at frame t.
-        simple_subgoal: T strings, intermediate-level text of the present checkpoint. After the last one its text
-            remains (``operation`` is -1 there), so the column is never empty.
-        grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
-        memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
-            "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
-        subtask: T strings, the intermediate-level text of the present checkpoint as an instruction.
+        simple_subgoal, grounded_subgoal, coarse_subgoal: T texts of the present checkpoint at the intermediate, fine
+            and coarse level. After the last one its text remains, so the columns are never empty.
+        memory: T oracle memories of the paper: intermediate texts of the completed checkpoints (`tasks.memory_text`).
+        subtask: T texts, the intermediate text of the present checkpoint as an instruction.
         key_frames: (K,) int64, frame at which checkpoint k was completed in order, -1 if it never was.
     """
 
@@ -226,7 +209,10 @@ def labels(demo: Demonstration) -> Labels:
     ever = np.logical_or.accumulate(demo.satisfied, axis=0)
     # One entry per value of index, 0 ... K; the last follows the last checkpoint. A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
-    texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
+    texts = {}
+    for number, level in enumerate(LEVELS):
+        of_level = [checkpoint.language[number] for checkpoint in task.checkpoints] or [task.language]
+        texts[level] = [*of_level, of_level[-1]]
     subtasks = subtask_texts(task)
     subtasks.append(subtasks[-1])
     memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
@@ -250,7 +236,6 @@ def labels(demo: Demonstration) -> Labels:
 
 
 def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return (K,) frames of ordered completion in a (T, K) truth table, -1 for never."""
     key_frames = np.full(satisfied.shape[1], -1, dtype=np.int64)
     frame = 0
     for k in range(satisfied.shape[1]):
@@ -262,16 +247,10 @@ def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
     return key_frames
 
 
-def _subgoals(task: Task, level: int) -> list[str]:
-    """Return K + 1 texts, the last one repeated; a task without checkpoints has its instruction."""
-    texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
-    return [*texts, texts[-1]]
-
-
 # --- language rows ---
 
 
-def persistent_rows(found: Labels) -> list[LanguageRow]:
+def persistent_rows(columns: Labels) -> list[LanguageRow]:
     """Return an episode's language rows for LeRobot's training recipes, sorted by timestamp, style, role.
 
     LeRobot stores them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
@@ -282,13 +261,12 @@ def persistent_rows(found: Labels) -> list[LanguageRow]:
     A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins, so
     no row names a completion too early. The per-frame string columns contain every change.
     """
-    rows = [_row("subtask", text, frame) for frame, text in _changes(found.subtask)]
-    rows += [_row("memory", text, frame) for frame, text in _changes(found.memory) if text]
+    rows = [_row("subtask", text, frame) for frame, text in _changes(columns.subtask)]
+    rows += [_row("memory", text, frame) for frame, text in _changes(columns.memory) if text]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
 
 
 def _changes(texts: list[str]) -> list[tuple[int, str]]:
-    """Return (frame, text) wherever a text begins, without empty and short-lived ones."""
     kept: list[tuple[int, str]] = []
     for frame, text in enumerate(texts):
         if not text or (frame > 0 and text == texts[frame - 1]):
@@ -341,7 +319,7 @@ def digest(demo: Demonstration) -> str:
     if found.held.any():  # an added column changes no hash of demonstrations without holds
         columns["held"] = found.held
     columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
-    # Independent of byte order, memory layout and dictionary order.
+    # The hash is independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):
         column = columns[name]

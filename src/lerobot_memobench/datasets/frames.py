@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
-from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
+from lerobot_memobench.datasets.episodes import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.layout import OBJECTS, PRIVILEGED, objects_column
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
+from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 
 _PLACE = ("index", "episode_index", "frame_index")
 
@@ -62,10 +62,8 @@ def read_frame_table(root: Path) -> FrameTable:
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    wanted = {*_PLACE, *CLOCK, "phase", HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
-    table = read_table(root / "data", lambda name: EARLIER_COLUMNS.get(name, name) in wanted)
-    check_clock(table.column_names, root)
-    table = table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names]).sort_by("index")
+    wanted = {*_PLACE, OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
+    table = read_table(root / "data", wanted.__contains__).sort_by("index")
     there = set(table.column_names)
     number = {name: numbers(table.column(name)).reshape(-1) for name in {*_PLACE, OBS_PHASE, HELD_COLUMN} & there}
     starts, expected = np.flatnonzero(number["frame_index"] == 0), np.arange(len(table))

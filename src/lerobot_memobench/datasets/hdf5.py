@@ -36,7 +36,6 @@ from lerobot_memobench.io import (
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.sim.scene_hash import FORMER, check_world
 
 if TYPE_CHECKING:
     import h5py
@@ -163,8 +162,6 @@ class PublishedFile:
             raise Unusable(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise Unusable("it is no group demo_<number>")
-        if "success" in group.attrs:
-            check_world(FORMER, "it was written by an earlier version of this package and", Unusable)
         states = array(group, "states", (None, None), np.float64)
         actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):

@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
-from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
-from lerobot_memobench.datasets.video import ImageHistograms, Stats
+from lerobot_memobench.datasets.layout import ADVICE, STATS_FILE
+from lerobot_memobench.datasets.video import ImageHistograms, Stats, frame_reader
+from lerobot_memobench.datasets.write import numeric_stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, read_json, short, write_file
 from lerobot_memobench.protocol import CLOCK

@@ -15,8 +15,8 @@ from typing import Any
 
 from lerobot.utils.constants import OBS_IMAGES
 
-from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.episodes import read_info
+from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
 from lerobot_memobench.policies.compatibility import cameras_read

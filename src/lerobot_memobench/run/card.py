@@ -41,7 +41,7 @@ PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transform
 
 def card_of(plan: EvaluationPlan) -> dict[str, Any]:
     """Return the card of an evaluation that is about to begin. Hashes the checkpoint."""
-    from lerobot_memobench.datasets.generation import task_hash
+    from lerobot_memobench.datasets.generate import task_hash
     from lerobot_memobench.tasks.catalogue import load_task
 
     environment, shard = plan.environment, plan.options.shard

@@ -13,9 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole, naming_damage
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice

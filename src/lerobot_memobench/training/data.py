@@ -20,6 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import (
     Encoded,
     FrameLookup,
@@ -29,10 +30,7 @@ from lerobot_memobench.datasets.frames import (
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
-from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.layout import without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -50,7 +48,6 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
 )
 from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_encoder
 from lerobot_memobench.protocol import OBS_PHASE
-from lerobot_memobench.sim.scene_hash import check_world
 from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
 from lerobot_memobench.training.sampler import seed_of
 from lerobot_memobench.training.texts import set_subgoals, with_targets
@@ -128,20 +125,7 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     check_episodes(given.episodes, meta)
     complete_statistics(config.policy, meta, given)
     train, held_out = make_train_eval_datasets(opened)
-    check_dataset_version(train.meta)
     return train, held_out
-
-
-def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset that an earlier version of the benchmark made: of other scenes, goals, prompts or holds."""
-    check_clock(meta.features, meta.root)
-    if EPISODE_INFO not in meta.features:
-        return
-    places = list_episodes(Path(meta.root))
-    for place in places:
-        if place.record is not None:
-            check_world(place.record.world, f"episode {place.index} of {meta.root}")
-    check_revision(Path(meta.root), places)
 
 
 def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:

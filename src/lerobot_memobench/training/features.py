@@ -25,9 +25,9 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
-from lerobot_memobench.datasets.images import FrameReader, frame_reader
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lerobot.datasets import LeRobotDatasetMetadata
 
+from lerobot_memobench.datasets.episodes import STRANGER, list_episodes
 from lerobot_memobench.datasets.frames import LEVEL_COLUMNS, MEMORY_COLUMN, FrameTable, read_frame_table
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, list_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ANSWERS,

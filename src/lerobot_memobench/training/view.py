@@ -31,18 +31,20 @@ from lerobot.utils.constants import OBS_IMAGES
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from PIL import Image, ImageOps
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
+from lerobot_memobench.datasets.demonstration import LEVEL_COLUMNS
+from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import LANGUAGE, PRIVILEGED, image_key
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.layout import (
     EPISODES,
     INFO_FILE,
+    LANGUAGE,
+    PRIVILEGED,
     STATS_FILE,
     TASKS_FILE,
+    image_key,
     without_pattern,
 )
-from lerobot_memobench.datasets.lerobot_format.tables import read_info, tables_of, undamaged
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.datasets.video import mirror_video, video_info
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
@@ -54,7 +56,7 @@ from lerobot_memobench.policies.compatibility import keeps_sizes
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
 from lerobot_memobench.training.configuration import check_environment, with_features
-from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
+from lerobot_memobench.training.data import check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
 SOURCE_EPISODE = "source_episode_index"
@@ -142,7 +144,6 @@ def viewed(
     if given.root is not None:
         given.root = str(without_pattern(Path(given.root)))
     meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
-    check_dataset_version(meta)
     check_episodes(given.episodes, meta)
     choice = choice_for(policy, meta.features, prompt_frames, obs_type)
     kept = choice.columns(meta.features)
@@ -228,7 +229,7 @@ def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | N
 
 def _is_ours(features: Mapping[str, Any]) -> bool:
     """Return whether a dataset is the benchmark's, by its texts too: a phase alone may have another meaning."""
-    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {EARLIER_COLUMNS.get(name, name) for name in features}
+    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {*features}
 
 
 def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:

@@ -14,7 +14,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTr
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 
-from lerobot_memobench.datasets.lerobot_format.columns import PRIVILEGED
+from lerobot_memobench.datasets.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest

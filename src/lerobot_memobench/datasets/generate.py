@@ -16,17 +16,17 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.card import SCRIPTED
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING, is_dataset
-from lerobot_memobench.datasets.recording import HOLD_FRAMES, RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging import (
+from lerobot_memobench.datasets.card import SCRIPTED
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING, is_dataset
+from lerobot_memobench.datasets.record import HOLD_FRAMES, RecordingJob, RecordingSettings
+from lerobot_memobench.datasets.stage import (
     FINISHED_EARLY,
     check_destination,
     episodes_folder,
     finished_manifest,
     staged,
 )
+from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words
 from lerobot_memobench.jobs.processes import ProgressCallback
@@ -77,11 +77,7 @@ def generate(
     request in ``out`` is continued; a finished one is reported again.
 
     Args:
-        tasks: tasks to demonstrate.
-        episodes, prompted_episodes: demonstrations of each task without and with a prompt.
-        out: destination.
         seed_base: episode i has the scene of seed ``seed_base`` + i.
-        workers: episodes made at a time.
         finish: assemble the dataset of an unfinished run's episodes, and make no further episode.
         notify: called before the first episode with the approximate size and duration.
         referent, images, image_size, demonstration_prompt, perturb, convention: see `recording.RecordingSettings`.
@@ -97,8 +93,18 @@ def generate(
             f"{len(tasks)} tasks, {episodes} episodes ({most} with a prompt), {workers} workers were asked for; each "
             "must be at least 1"
         )
-    most = max(episodes_of(task, episodes, prompted_episodes) for task in tasks)
-    _check_seeds(range(seed_base, seed_base + most))
+    names = [task.name for task in tasks]
+    if len(set(names)) < len(names):
+        raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
+    last_seed = seed_base + max(episodes_of(task, episodes, prompted_episodes) for task in tasks) - 1
+    for name in GUARDED:
+        split = SPLITS[name]
+        if seed_base <= split[-1] and last_seed >= split[0]:
+            raise MemobenchError(
+                f"seeds {seed_base} to {last_seed} reach into the split '{name}' ({split[0]} to {split[-1]}), on which "
+                f"no policy is trained; ask for seeds within {DEMONSTRATION_SEED} to {SPLITS['demonstrations'][-1]}, "
+                f"such as --seed-base {DEMONSTRATION_SEED}; evaluate policy=memobench_expert to measure the expert"
+            )
     hiding = next((task for task in tasks if task.prompt is not None and not task.prompt.restores), None)
     if hiding is not None and not demonstration_prompt:
         raise MemobenchError(
@@ -117,7 +123,7 @@ def generate(
 
 @dataclass(frozen=True)
 class _Plan:
-    """Episodes that a run has to make."""
+    """Episodes that a run has to make, and its settings."""
 
     tasks: tuple[Task, ...]
     episodes: int
@@ -125,11 +131,6 @@ class _Plan:
     seed_base: int
     settings: RecordingSettings
     repo_id: str
-
-    def __post_init__(self) -> None:
-        names = [task.name for task in self.tasks]
-        if len(set(names)) < len(names):
-            raise MemobenchError(f"a task was named twice among {', '.join(names)}; name each once")
 
     @property
     def request(self) -> dict[str, Any]:
@@ -156,16 +157,11 @@ class _Plan:
         return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
 
     def jobs(self, folder: Path) -> list[RecordingJob]:
-        """Return one job per seed of each task, each with its own folder in ``folder``."""
-        seeds = [
-            (task, self.seed_base + i)
-            for task in self.tasks
-            for i in range(episodes_of(task, self.episodes, self.prompted_episodes))
-        ]
-        return [
-            RecordingJob(task, seed, self.settings, folder / f"{number:06d}")
-            for number, (task, seed) in enumerate(seeds)
-        ]
+        jobs: list[RecordingJob] = []
+        for task in self.tasks:
+            for i in range(episodes_of(task, self.episodes, self.prompted_episodes)):
+                jobs.append(RecordingJob(task, self.seed_base + i, self.settings, folder / f"{len(jobs):06d}"))
+        return jobs
 
 
 # --- the run ---
@@ -174,10 +170,9 @@ class _Plan:
 def _run(
     plan: _Plan, out: Path, workers: int, progress: ProgressCallback | None, notify: Callable[[str], None]
 ) -> GenerationSummary:
-    """Make the missing episodes, then the dataset."""
     manifest = finished_manifest(out, plan.request)
     if manifest is not None:
-        return summarise(manifest["episodes"], plan.tasks, out)
+        return _summary(manifest["episodes"], plan, out)
     check_destination(out)
     with (
         explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
@@ -190,14 +185,13 @@ def _run(
 
 
 def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
-    """Assemble the dataset of an unfinished run's episodes."""
     if is_dataset(out) or not (out / STAGING).is_dir():
         raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
     with explaining_disk_errors(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
         jobs = plan.jobs(folder)
-        there = [job for job in jobs if job.finished()]
-        made_by = f"{plan.made_by} The run was finished early: {len(there)} of {len(jobs)} seeds were run."
-        return _assembled(plan, there, out, {**plan.request, FINISHED_EARLY: len(there) < len(jobs)}, made_by)
+        finished = [job for job in jobs if job.finished()]
+        made_by = f"{plan.made_by} The run was finished early: {len(finished)} of {len(jobs)} seeds were run."
+        return _assembled(plan, finished, out, {**plan.request, FINISHED_EARLY: len(finished) < len(jobs)}, made_by)
 
 
 def _assembled(
@@ -205,7 +199,7 @@ def _assembled(
 ) -> GenerationSummary:
     """Assemble the dataset of finished jobs, if one of them has an episode, and remove the staging folder."""
     episodes = [staged(job) for job in jobs]
-    summary = summarise([{**episode.info, "failure": episode.failure} for episode in episodes], plan.tasks, out)
+    summary = _summary([{**episode.info, "failure": episode.failure} for episode in episodes], plan, out)
     if summary.folder is not None:
         assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest={"request": request})
         shutil.rmtree(out / STAGING)
@@ -217,18 +211,6 @@ def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int
     return episodes if task.prompt is None or prompted_episodes is None else prompted_episodes
 
 
-def _check_seeds(seeds: range) -> None:
-    """Refuse seeds on which policies are chosen or measured (`protocol.GUARDED`)."""
-    for name in GUARDED:
-        split = SPLITS[name]
-        if seeds[0] <= split[-1] and seeds[-1] >= split[0]:
-            raise MemobenchError(
-                f"seeds {seeds[0]} to {seeds[-1]} reach into the split '{name}' ({split[0]} to {split[-1]}), on which "
-                f"no policy is trained; ask for seeds within {DEMONSTRATION_SEED} to {SPLITS['demonstrations'][-1]}, "
-                f"such as --seed-base {DEMONSTRATION_SEED}; evaluate policy=memobench_expert to measure the expert"
-            )
-
-
 def task_hash(task: Task) -> str:
     """Return a hash of a task's files: a run must not be continued with an edited task."""
     text = task.bddl_text + json.dumps(task.metadata, sort_keys=True)
@@ -237,13 +219,13 @@ def task_hash(task: Task) -> str:
 
 def _versions() -> dict[str, str]:
     """Return the versions on which an episode's numbers depend."""
-    found = {}
+    versions = {}
     for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+            versions[name] = "unknown"
+    return versions
 
 
 # --- size and time ---
@@ -255,24 +237,19 @@ def run_size(frames: int, image_size: int | None, held: int = 0) -> int:
     return round(frames * FRAME_BYTES + (frames * IMAGES_BYTES + held * HELD_BYTES) * area)
 
 
-def check_room(out: Path, size: int, there: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
-    """Report the disk space that a run needs, and refuse a run that cannot fit.
+def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
+    """Report the disk space that a run needs, and refuse a run of which not even one copy has room.
 
     Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
 
     Args:
-        out: destination.
-        size: approximate bytes of the dataset.
-        there: bytes of it that are staged already.
+        size: approximate bytes of the dataset; ``staged`` of them exist already.
         work: amount of work, which begins the message.
         extra: bytes of temporary files.
-
-    Raises:
-        MemobenchError: not even one copy has room.
     """
-    free, most = free_bytes(out), max(2 * size - there, 0) + extra
+    free, most = free_bytes(out), max(2 * size - staged, 0) + extra
     sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
-    if free < size - there + extra:
+    if free < size - staged + extra:
         raise MemobenchError(f"{work} would take {sizes}: make room, name a folder on another disk, or ask for less")
     warning = "; THAT MAY NOT BE ENOUGH: a full disk ends the run, and the same command then continues"
     notify(f"{work}: {sizes}{warning * (free < most)}")
@@ -281,7 +258,6 @@ def check_room(out: Path, size: int, there: int, notify: Callable[[str], None], 
 def _report_size(
     plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, notify: Callable[[str], None]
 ) -> None:
-    """Report size and duration of the missing episodes before they are made."""
     missing = [job for job in jobs if not job.folder.exists()]
     if not missing:
         return
@@ -306,57 +282,31 @@ def _report_size(
 
 
 @dataclass(frozen=True)
-class Failure:
-    """A seed without a demonstration, and the reason."""
+class EpisodeOutcome:
+    """A requested seed, the frames of its episode, and the reason if there is no demonstration of it."""
 
     task_name: str
     seed: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class TaskSummary:
-    """Outcome of one task: ``frames`` are those of its successful episodes, holding frames included."""
-
-    name: str
-    memory_type: str
-    episodes: int
-    solved: int
-    frames: tuple[int, ...]
-    failures: tuple[Failure, ...]
+    frames: int
+    failure: str | None
 
 
 @dataclass(frozen=True)
 class GenerationSummary:
-    """Outcome of a run.
-
-    Attributes:
-        folder: the dataset, or None if no episode succeeded.
-        tasks: one entry per task, in the requested order.
-    """
+    """Outcome of a run: its dataset, or None if no episode succeeded, the requested tasks, and the seeds in order."""
 
     folder: Path | None
-    tasks: tuple[TaskSummary, ...]
+    tasks: tuple[str, ...]
+    episodes: tuple[EpisodeOutcome, ...]
 
     @property
-    def failures(self) -> tuple[Failure, ...]:
-        """All seeds without a demonstration."""
-        return tuple(failure for task in self.tasks for failure in task.failures)
-
-    @property
-    def exit_status(self) -> int:
-        """0 if every requested seed was solved, else 1."""
-        return 1 if self.failures else 0
+    def failures(self) -> list[EpisodeOutcome]:
+        """Seeds without a demonstration."""
+        return [episode for episode in self.episodes if episode.failure is not None]
 
 
-def summarise(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
-    """Return the outcome of each task from the rows of the manifest."""
-    summaries = tuple(_summary(task, [row for row in rows if row["task_name"] == task.name]) for task in tasks)
-    made = any(summary.solved for summary in summaries)
-    return GenerationSummary(out if made else None, summaries)
-
-
-def _summary(task: Task, rows: Sequence[dict[str, Any]]) -> TaskSummary:
-    frames = tuple(int(row["frames"]) for row in rows if row["failure"] is None)
-    failures = tuple(Failure(task.name, row["seed"], row["failure"]) for row in rows if row["failure"] is not None)
-    return TaskSummary(task.name, task.memory_type, len(rows), len(frames), frames, failures)
+def _summary(rows: Sequence[dict[str, Any]], plan: _Plan, out: Path) -> GenerationSummary:
+    """Return the outcome of a run from the rows of its manifest."""
+    episodes = tuple(EpisodeOutcome(row["task_name"], row["seed"], row["frames"], row["failure"]) for row in rows)
+    made = any(episode.failure is None for episode in episodes)
+    return GenerationSummary(out if made else None, tuple(task.name for task in plan.tasks), episodes)

@@ -31,41 +31,36 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole
-from lerobot_memobench.datasets.lerobot_format.layout import STAGING, TOP_LEVEL, is_dataset
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
+from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
-from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
-RECORD_FILE = "episode.json"
+EPISODE_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
 """Key of a dataset's request: whether episodes of it were left out."""
-DEFAULTS: dict[str, Any] = {"perturb": False, "prompted_episodes": None, FINISHED_EARLY: False, WORLD: FORMER}
-DEFAULTS |= {"convention": UPRIGHT, "upside_down": False}  # the latter was an option of `memobench convert`
-"""Values of keys that a request may lack."""
 ADVICE = "it is damaged; delete its folder and run the command again"
 
 
 # --- a finished episode ---
 
 
-class Record(BaseModel):
+class EpisodeFile(BaseModel):
     """``episode.json``.
 
     Attributes:
         failure: why there is no demonstration of this seed, or None.
-        info: see `episode_info`; of a failed episode at least its task's name and seed.
-        language_persistent: LeRobot's persistent language rows (see ``persistent_rows``).
-        image_stats: name of a camera's video to the statistics of its pixels (see ``ImageHistograms``).
+        info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
+            episode at least its task's name and seed.
+        language_persistent: LeRobot's persistent language rows (`persistent_rows`).
+        image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
         files: name to sha256 of the other files.
     """
 
@@ -78,33 +73,37 @@ class Record(BaseModel):
 
 @dataclass(frozen=True)
 class StagedEpisode:
-    """A finished episode's folder and its record; arrays and videos are read on demand."""
+    """A finished episode's folder and the content of its `EpisodeFile`; arrays and videos are read on demand."""
 
     folder: Path
-    record: Record
+    content: EpisodeFile
 
     @property
     def failure(self) -> str | None:
         """Why there is no demonstration of this seed, or None."""
-        return self.record.failure
+        return self.content.failure
 
     @property
     def info(self) -> dict[str, Any]:
-        """Identity and per-episode metadata (see `episode_info`)."""
-        return self.record.info
+        """Identity and frames, also of a failed episode."""
+        return self.content.info
 
     @property
-    def has_images(self) -> bool:
-        """Whether its cameras were recorded."""
-        return bool(self.record.image_stats)
+    def length(self) -> int:
+        """Number of frames."""
+        return int(self.info["frames"])
+
+    def record(self, versions: dict[str, str] | None = None) -> DemonstrationRecord:
+        """Return the record of a successful episode."""
+        return DemonstrationRecord.model_validate(self.info | {"versions": versions})
 
     def video(self, camera: str) -> Path:
         """Return the file of a camera's video."""
         return self.folder / f"{camera}.mp4"
 
     def image_stats(self, camera: str) -> Stats:
-        """Return the statistics of a camera's pixels (see `ImageHistograms`)."""
-        return {name: np.array(value) for name, value in self.record.image_stats[camera].items()}
+        """Return the statistics of a camera's pixels (`ImageHistograms`)."""
+        return {name: np.array(value) for name, value in self.content.image_stats[camera].items()}
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
@@ -113,12 +112,12 @@ class StagedEpisode:
 
     def check(self) -> None:
         """Raise a MemobenchError that names the first file whose hash differs from the recorded one."""
-        for name, expected in self.record.files.items():
+        for name, expected in self.content.files.items():
             path = self.folder / name
-            found = file_hash(path) if path.is_file() else "missing"
-            if found != expected:
+            digest = file_hash(path) if path.is_file() else "missing"
+            if digest != expected:
                 raise MemobenchError(
-                    f"{path} is damaged (sha256 {found[:12]}, written as {expected[:12]}); delete the folder "
+                    f"{path} is damaged (sha256 {digest[:12]}, written as {expected[:12]}); delete the folder "
                     f"{self.folder} and repeat the command to make this episode again"
                 )
 
@@ -126,7 +125,7 @@ class StagedEpisode:
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the finished episode in ``folder``, or None if there is none."""
     try:
-        return StagedEpisode(folder, read_json(folder / RECORD_FILE, Record, ADVICE))
+        return StagedEpisode(folder, read_json(folder / EPISODE_FILE, EpisodeFile, ADVICE))
     except FileNotFoundError:
         return None
 
@@ -147,10 +146,10 @@ class StagedJob:
 
 def staged(job: StagedJob) -> StagedEpisode:
     """Return the finished episode of a job that was run."""
-    found = read_staged(job.folder)
-    if found is None:
+    episode = read_staged(job.folder)
+    if episode is None:
         raise MemobenchError(f"{job.folder} was removed during the run; run the command again")
-    return found
+    return episode
 
 
 # --- writing an episode ---
@@ -199,30 +198,26 @@ class EpisodeStage:
                 f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
                 "were recorded; add one per frame and camera, or none"
             )
-        found, info = labels(demo), episode_info(demo)
-        _check_storable(info, found.columns())
+        columns = labels(demo)
+        record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
+        info = record | {"language": demo.task.language, "frames": len(demo)}
+        _check_storable(info, columns.columns())
         for video in self._videos.values():
             video.close()
         stats = {
             camera: {name: value.tolist() for name, value in histograms.stats().items()}
             for camera, histograms in (self._histograms if self._frames else {}).items()
         }
-        columns: dict[str, Any] = {
+        arrays: dict[str, Any] = {
             "states": demo.states,
             "actions": demo.actions,
             "proprio": demo.proprio,
             "objects": demo.objects,
             **({} if demo.executed is None else {"executed": demo.executed}),
-            **found.columns(),
+            **columns.columns(),
         }
-        np.savez_compressed(self._temporary / ARRAYS_FILE, **columns)
-        return _publish(self._temporary, self._folder, None, info, persistent_rows(found), stats)
-
-
-def episode_info(demo: Demonstration) -> dict[str, Any]:
-    """Return the fields of an episode for meta/episodes, manifest and card."""
-    record = EpisodeRecord.of(demo).model_dump(exclude={"versions"})
-    return record | {"language": demo.task.language, "frames": len(demo)}
+        np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
+        return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)
 
 
 def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
@@ -266,8 +261,10 @@ def _publish(
 ) -> StagedEpisode:
     """Add the record, flush everything to the disk, then give the folder its name."""
     files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    record = Record(failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files)
-    (temporary / RECORD_FILE).write_text(record.model_dump_json())
+    content = EpisodeFile(
+        failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files
+    )
+    (temporary / EPISODE_FILE).write_text(content.model_dump_json())
     flush_to_disk([*temporary.iterdir(), temporary])
     try:
         temporary.rename(folder)
@@ -277,7 +274,7 @@ def _publish(
             raise MemobenchError(f"{folder} holds another episode; delete it and run again") from None
         return staged
     flush_to_disk([folder.parent])
-    return StagedEpisode(folder, record)
+    return StagedEpisode(folder, content)
 
 
 def temporary_folder(folder: Path) -> Path:
@@ -377,7 +374,7 @@ def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dic
 
 def _compare_requests(earlier: dict[str, Any], request: dict[str, Any], subject: str, advice: str) -> None:
     """Raise, naming the first setting that differs."""
-    for key, value in {**DEFAULTS, **request}.items():
-        there = {**DEFAULTS, **earlier}.get(key)
-        if there != value:
-            raise MemobenchError(f"{subject} with {key}={short(there)}, now {short(value)} was asked for; {advice}")
+    for key, value in {FINISHED_EARLY: False, **request}.items():  # only `generate --finish` writes this key
+        before = {FINISHED_EARLY: False, **earlier}.get(key)
+        if before != value:
+            raise MemobenchError(f"{subject} with {key}={short(before)}, now {short(value)} was asked for; {advice}")

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.staging import EpisodeStage, StagedJob, stage_failure
+from lerobot_memobench.datasets.stage import EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE

@@ -1,8 +1,12 @@
-"""Columns of a dataset's frames: names, types and meanings."""
+"""Names of a dataset's files, and names, types and meanings of its columns."""
 
 from __future__ import annotations
 
+import glob
+import hashlib
+import os
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +17,50 @@ from lerobot_memobench.datasets.demonstration import (
     MAX_CHECKPOINTS,
     MEMORY_COLUMN,
 )
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CAMERAS, CLOCK, OBS_PHASE, OBS_STEP
+from lerobot_memobench.io import cache_folder, files_below
+from lerobot_memobench.protocol import CAMERAS, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.sim.object_layout import NAMES
+
+STAGING = ".staging"
+"""Folder of an unfinished run within its destination."""
+DEFAULT_REPO_ID = "memobench/memobench"
+MANIFEST_FILE = "manifest.json"
+INFO_FILE = Path("meta") / "info.json"
+STATS_FILE = Path("meta") / "stats.json"
+TASKS_FILE = Path("meta") / "tasks.parquet"
+EPISODES = "meta/episodes"
+TOP_LEVEL = ("videos", "states", "data", "README.md", MANIFEST_FILE, "meta")
+"""In the order in which they are moved into place; with `meta` the folder becomes a dataset."""
+ADVICE = "the dataset is damaged; generate it or take it from its source again"
+
+
+def is_dataset(folder: Path) -> bool:
+    """Return whether ``folder`` holds a finished LeRobotDataset."""
+    return (folder / INFO_FILE).is_file()
+
+
+def dataset_files(folder: Path) -> list[str]:
+    """Return the paths of a dataset's files below ``folder``, without card, manifest and caches."""
+    folders = [folder / name for name in TOP_LEVEL if not Path(name).suffix]
+    return sorted(path.relative_to(folder).as_posix() for part in folders for path in files_below(part))
+
+
+def without_pattern(folder: Path) -> Path:
+    """Return a path of a dataset's folder for LeRobot, which reads names such as ``obj [v2]`` as patterns of `glob`.
+
+    It is the folder itself, or a link to it in the cache. The link is the same at every call, because LeRobot caches
+    the tables by path.
+    """
+    place = str(folder.absolute())
+    if glob.escape(place) == place or not folder.is_dir():
+        return folder
+    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    link.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):
+        link.symlink_to(place)
+    return link
+
 
 EPISODE_INFO = "episode_info"
 """Column of frames with the episode's record at its first frame, empty elsewhere."""
@@ -135,22 +179,5 @@ def image_key(camera: str) -> str:
 
 
 def objects_column(names: Collection[str]) -> str:
-    """Return the column of objects among ``names``; datasets with images of earlier versions use LeRobot's name."""
+    """Return the column of objects among ``names``: `PRIVILEGED`, or without images `OBJECTS`."""
     return PRIVILEGED if PRIVILEGED in names else OBJECTS
-
-
-def check_clock(names: Collection[str], where: Path | str) -> None:
-    """Refuse a dataset of an earlier version, whose prompts would be read as execution.
-
-    Args:
-        names: its columns.
-        where: its folder.
-
-    Raises:
-        MemobenchError: it has the column ``phase`` of that version instead of the present ones.
-    """
-    if {"phase", "simple_subgoal"} <= set(names) and not set(CLOCK) <= set(names):
-        raise MemobenchError(
-            f"{where} was made by an earlier version: it has the column phase instead of {' and '.join(CLOCK)}; "
-            "generate or convert it again"
-        )

@@ -1,7 +1,12 @@
-"""Assemble a dataset from finished episodes.
+"""Assemble a LeRobotDataset v3.0 from finished episodes.
 
 It is built in the hidden folder ``.staging`` of its destination and moved up, ``meta`` last: without
 ``meta/info.json`` a folder is not a dataset.
+
+:func:`assemble` takes episodes that workers have staged, already encoded; :func:`write_dataset` stages demonstrations
+that are in memory first. LeRobot's own metadata writer and feature schema are used; its frame-by-frame recording loop
+is not, because it writes every image as PNG first, copies a growing video again for every episode, and drops language
+rows, which a second pass has to add.
 """
 
 from __future__ import annotations
@@ -9,33 +14,30 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.datasets.card import write_card
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
-from lerobot_memobench.datasets.lerobot_format.card import write_card
-from lerobot_memobench.datasets.lerobot_format.columns import (
+from lerobot_memobench.datasets.episodes import ListedEpisode
+from lerobot_memobench.datasets.layout import (
+    DEFAULT_REPO_ID,
     EPISODE_INFO,
     EXECUTED_ACTION,
     LANGUAGE,
-    dataset_features,
-    image_key,
-    objects_column,
-)
-from lerobot_memobench.datasets.lerobot_format.layout import (
-    DEFAULT_REPO_ID,
     MANIFEST_FILE,
     STAGING,
     TOP_LEVEL,
+    dataset_features,
     dataset_files,
+    image_key,
+    objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.manifest import Written
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.staging import (
+from lerobot_memobench.datasets.stage import (
     TEMPORARY,
     StagedEpisode,
     check_destination,
@@ -104,9 +106,6 @@ def assemble(
     Deterministic: equal episodes give equal files.
 
     Args:
-        episodes: staged episodes.
-        out: destination.
-        repo_id: name of the dataset.
         made_by: sentence for the card.
         manifest: further content of manifest.json.
         left_out: reasons for the card why further episodes are missing.
@@ -115,7 +114,7 @@ def assemble(
     written = [episode for episode in episodes if episode.failure is None]
     if not written:
         raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
-    if len({tuple(episode.record.image_stats) for episode in written}) > 1:
+    if len({tuple(episode.content.image_stats) for episode in written}) > 1:
         raise MemobenchError(
             f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
         )
@@ -125,65 +124,67 @@ def assemble(
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     versions = (manifest or {}).get("request", {}).get("versions")
-    features = _write_lerobot(written, build, repo_id, versions)  # makes the folder
-    _write_manifest(episodes, manifest or {}, build)
-    write_card(build, episodes, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    features, listed = _write_lerobot(written, build, repo_id, versions)  # makes the folder
+    _write_manifest(episodes, listed, manifest or {}, build)
+    failed = [episode for episode in episodes if episode.failure is not None]
+    write_card(build, listed, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
     _move(build, out)
     return out
 
 
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
-) -> dict[str, dict[str, Any]]:
-    """Write the LeRobotDataset of the episodes into ``build``, with ``versions`` of packages; return its features."""
+) -> tuple[dict[str, dict[str, Any]], list[ListedEpisode]]:
+    """Write the LeRobotDataset of the episodes into ``build``; return its features and its list of episodes."""
+    from lerobot.datasets.compute_stats import aggregate_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
+    cameras = written[0].content.image_stats
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0]), written[0].record.image_stats),
+        features=dataset_features(_image_size(written[0]), cameras),
         root=build,
         robot_type=ROBOT_TYPE,
-        use_videos=written[0].has_images,
+        use_videos=bool(cameras),
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    meta.stats = _write_frames(meta, written, versions) | _image_statistics(written)
+    numbers, listed = _write_frames(meta, written, versions)
+    of_images = aggregate_stats([_camera_statistics(episode) for episode in written]) if cameras else {}
+    # LeRobot's come in the order of a set, another one in each process.
+    meta.stats = numbers | {key: of_images[key] for key in map(image_key, cameras)}
     write_stats(meta.stats, meta.root)
     meta.finalize()
-    return dict(meta.features)
+    return dict(meta.features), listed
 
 
 def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
-    if not episode.has_images:
-        return None
     import av
 
-    with av.open(str(episode.video(next(iter(episode.record.image_stats))))) as container:
-        stream = container.streams.video[0]
-        return stream.height, stream.width
+    for camera in episode.content.image_stats:
+        with av.open(str(episode.video(camera))) as container:
+            stream = container.streams.video[0]
+            return stream.height, stream.width
+    return None
 
 
-def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], build: Path) -> None:
+def _write_manifest(
+    episodes: Sequence[StagedEpisode], listed: Sequence[ListedEpisode], extra: dict[str, Any], build: Path
+) -> None:
     """Write the hashes of all files and requested episodes; failed ones have a reason instead of an index."""
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
-    rows, index = [], 0
+    rows, indices = [], iter(listed)
     for episode in episodes:
         row = {key: episode.info.get(key) for key in keys}
         row |= {key: episode.info[key] for key in ("world", "stand_ins") if key in episode.info}
-        row |= {"episode_index": None if episode.failure else index, "failure": episode.failure}
-        index += episode.failure is None
-        rows.append(row)
-    content = extra | {"episodes": rows, "files": _written_files(build)}
-    write_file(build / MANIFEST_FILE, json.dumps(content, indent=1), durable=True)
-
-
-def _written_files(folder: Path) -> dict[str, Written]:
-    """Return size and hash of each of a dataset's files, for its manifest."""
-    return {
-        name: {"bytes": (folder / name).stat().st_size, "sha256": file_hash(folder / name)}
-        for name in dataset_files(folder)
+        index = next(indices).index if episode.failure is None else None
+        rows.append(row | {"episode_index": index, "failure": episode.failure})
+    files = {
+        name: {"bytes": (build / name).stat().st_size, "sha256": file_hash(build / name)}
+        for name in dataset_files(build)
     }
+    write_file(build / MANIFEST_FILE, json.dumps(extra | {"episodes": rows, "files": files}, indent=1), durable=True)
 
 
 def _move(build: Path, out: Path) -> None:
@@ -204,24 +205,24 @@ def _move(build: Path, out: Path) -> None:
 
 
 def _write_frames(
-    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: Mapping[str, str] | None
-) -> dict[str, Stats]:
-    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers without held frames.
+    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: dict[str, str] | None
+) -> tuple[dict[str, Stats], list[ListedEpisode]]:
+    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers, and the episodes' places.
 
     Each episode is one row group, in files of LeRobot's size.
     """
     data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
     numbers: dict[str, list[NDArray]] = {}
+    listed: list[ListedEpisode] = []
     start = 0
     for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
         if data.size() >= meta.data_files_size_in_mb * 1024**2:
             data.next(meta.chunks_size)
         if number and number % EPISODES_PER_STATES_FILE == 0:
             states.next(meta.chunks_size)
-        task, length = str(episode.info["language"]), int(episode.info["frames"])
+        task, length = str(episode.info["language"]), episode.length
         meta.save_episode_tasks([task])
-        arrays = episode.arrays()
-        record = EpisodeRecord.model_validate(episode.info | {"versions": versions})
+        arrays, record = episode.arrays(), episode.record(versions)
         numbering = {
             "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
             "frame_index": np.arange(length),
@@ -229,42 +230,38 @@ def _write_frames(
             "index": start + np.arange(length),
             "task_index": np.full(length, meta.get_task_index(task)),
         }
-        columns = _columns(arrays, numbering, record, meta.features)
-        data.write(frames_table(columns, episode, meta.features))
-        states.write(states_table(arrays["states"], number))
+        info = np.full(length, "", dtype=object)
+        info[0] = record.in_frames()
+        columns = {
+            "observation.state": arrays["proprio"],
+            "action": arrays["actions"],
+            EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
+            **numbering,
+            EPISODE_INFO: info,
+            objects_column(meta.features): arrays["objects"],
+            **{key: arrays[key] for key in meta.features if key in arrays},
+        }
+        data.write(_frames_table(columns, episode, meta.features))
+        states.write(_states_table(arrays["states"], number))
         # LeRobot does not normalise columns without statistics: phase and step reach a policy as in a rollout.
         numeric = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
+        # Held frames do not count: nothing is learned from them, and they may be most frames.
         counted = {key: value[~arrays[HELD_COLUMN]] for key, value in numeric.items()}
         for key, value in counted.items():
             numbers.setdefault(key, []).append(value)
         stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)
-        place = {
+        files = {
             "data/chunk_index": data.chunk,
             "data/file_index": data.file,
             "dataset_from_index": start,
             "dataset_to_index": start + length,
         }
-        meta.save_episode(number, length, [task], stats, place | videos | record.in_meta())
+        meta.save_episode(number, length, [task], stats, files | videos | record.in_meta())
+        listed.append(ListedEpisode(number, start, length, record))
         start += length
     data.close()
     states.close()
-    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}
-
-
-def _columns(
-    arrays: Mapping[str, NDArray], numbering: Mapping[str, NDArray], record: EpisodeRecord, features: Collection[str]
-) -> dict[str, NDArray]:
-    info = np.full(len(arrays["actions"]), "", dtype=object)
-    info[0] = record.in_frames()
-    return {
-        "observation.state": arrays["proprio"],
-        "action": arrays["actions"],
-        EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
-        **numbering,
-        EPISODE_INFO: info,
-        objects_column(features): arrays["objects"],
-        **{key: arrays[key] for key in features if key in arrays},
-    }
+    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}, listed
 
 
 def numeric_stats(values: NDArray) -> Stats:
@@ -286,47 +283,22 @@ def _stats_of(flat: NDArray[np.float64]) -> Stats:
 
 
 def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
-    return {image_key(camera): episode.image_stats(camera) for camera in episode.record.image_stats}
-
-
-def _image_statistics(episodes: Sequence[StagedEpisode]) -> dict[str, Stats]:
-    """Return the statistics of all pixels, over the frames that were sampled of each episode."""
-    from lerobot.datasets.compute_stats import aggregate_stats
-
-    found = [_camera_statistics(episode) for episode in episodes]
-    whole = aggregate_stats(found)
-    return {key: whole[key] for key in found[0]}  # LeRobot's come in the order of a set, another one in each process
+    return {image_key(camera): episode.image_stats(camera) for camera in episode.content.image_stats}
 
 
 # --- tables and their files ---
 
 
-def frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
-    """Return an episode's frames as a table of the type that LeRobot reads.
-
-    Args:
-        columns: name to one value or row per frame.
-        episode: their episode, whose language rows are added.
-        features: LeRobot's description of all columns.
-
-    Raises:
-        MemobenchError: a column is missing.
-    """
+def _frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
+    """Return an episode's columns and language rows as a table of the type that LeRobot reads."""
     import pyarrow as pa
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     typed = get_hf_features_from_features(features)
-    arrays = []
-    for field in typed.arrow_schema:
-        if field.name == LANGUAGE:
-            arrays.append(_language(episode, typed[LANGUAGE]))
-        elif field.name in columns:
-            arrays.append(_array(columns[field.name], field.type))
-        else:
-            raise MemobenchError(
-                f"{episode.folder} was staged by an older version, without the column {field.name}; delete the folder "
-                "and repeat the command to make this episode again"
-            )
+    arrays = [
+        _language(episode, typed[LANGUAGE]) if field.name == LANGUAGE else _array(columns[field.name], field.type)
+        for field in typed.arrow_schema
+    ]
     return pa.Table.from_arrays(arrays, schema=typed.arrow_schema)
 
 
@@ -343,12 +315,12 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
     import datasets
 
     once = datasets.Dataset.from_dict(
-        {LANGUAGE: [episode.record.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
+        {LANGUAGE: [episode.content.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
     ).with_format("arrow")[:]
-    return once.column(LANGUAGE).combine_chunks().take(np.zeros(int(episode.info["frames"]), dtype=np.int64))
+    return once.column(LANGUAGE).combine_chunks().take(np.zeros(episode.length, dtype=np.int64))
 
 
-def states_table(states: NDArray[np.float64], number: int) -> pa.Table:
+def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
     """Return the simulator's states, for replay; their width differs between tasks."""
     import pyarrow as pa
 
@@ -410,9 +382,9 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
 
     places: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
-    for camera in episodes[0].record.image_stats:
+    for camera in episodes[0].content.image_stats:
         key, chunk, file = image_key(camera), 0, 0
-        videos = [(episode.video(camera), int(episode.info["frames"])) for episode in episodes]
+        videos = [(episode.video(camera), episode.length) for episode in episodes]
         for group in _grouped([video.stat().st_size for video, _ in videos], limit):
             assert meta.video_path is not None
             path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
