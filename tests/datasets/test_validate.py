@@ -34,7 +34,7 @@ from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import LEVELS
-from lerobot_memobench.training.view import Choice, needs_view
+from lerobot_memobench.training.view import ViewOptions, needs_view
 from tests.datasets.conftest import FRAMES
 from tests.support.short_demonstrations import drawn_steps
 from tests.support.videos import encode_video
@@ -141,7 +141,7 @@ def test_columns_of_earlier_versions_are_read(simulated, copy):
     assert earlier.subgoals == present.subgoals
     assert set(earlier.subgoals) == set(LEVELS)
     assert earlier.memory == present.memory
-    assert needs_view(info["features"], Choice(obs_type="pixels"))
+    assert needs_view(info["features"], ViewOptions(obs_type="pixels"))
     assert [verdict.disagreement for verdict in validate(folder)] == [None] * len(validate(folder))
     change(folder, "data/**/*.parquet", "grounded_subgoal", FRAMES + FRAME)
     assert difference(folder).startswith(f"subgoal.fine at frame {FRAME}")

@@ -12,8 +12,18 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
-from lerobot_memobench.perception.geometry import projected, view_of, views_of
-from lerobot_memobench.perception.objects import APART, FACING, MIN_SCORE_ALONE, ONE, PARTS, SAME, ObjectLocalizer
+from lerobot_memobench.perception.objects import (
+    APART,
+    FACING,
+    MIN_SCORE_ALONE,
+    ONE,
+    PARTS,
+    SAME,
+    ObjectLocalizer,
+    projected,
+    view_of,
+    views_of,
+)
 from lerobot_memobench.perception.weights import (
     PACKAGE,
     load_detector,

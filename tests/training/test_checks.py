@@ -15,8 +15,9 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.sim.scene_hash import LIBERO
-from lerobot_memobench.training.configuration import READ, check_settings
+from lerobot_memobench.training.command import READ, check_settings, complete_training
 from lerobot_memobench.training.data import check_dataset_version, open_datasets
 from lerobot_memobench.training.loop import begin
 from tests.support.object_dataset import make_object_dataset
@@ -42,10 +43,6 @@ def test_too_small_numbers_are_refused(word: str, synthetic: Path, capsys: pytes
         ({"reward_model": SimpleNamespace()}, "reward_model"),
         ({"field_of_tomorrow": 3}, "field_of_tomorrow=3 has no effect"),
         ({"eval": EvalConfig(recording=True)}, "eval.recording"),
-        ({"eval_steps": 2}, "dataset.eval_split"),
-        ({"rename_map": {"a": "b"}}, "rename_map"),
-        ({"save_checkpoint_to_hub": True}, "policy.repo_id"),
-        ({"use_policy_training_preset": False}, "optimizer.type"),
         ({"parallelism": SimpleNamespace(is_sharded=True)}, "parallelism"),
         ({"ema": SimpleNamespace(enable=True)}, "ema"),
         ({"checkpoint_format": "dcp"}, "checkpoint_format"),
@@ -59,6 +56,22 @@ def test_unsupported_settings_are_refused(changed: dict[str, Any], named: str) -
         setattr(asked, name, value)
     with pytest.raises(MemobenchError, match=named):
         check_settings(asked)
+
+
+@pytest.mark.parametrize(
+    ("word", "named"),
+    [
+        ("eval_steps=2", "dataset.eval_split"),
+        ("rename_map={a: b}", "rename_map"),
+        ("save_checkpoint_to_hub=true", "policy.repo_id"),
+        ("use_policy_training_preset=false", "Optimizer"),
+    ],
+)
+@pytest.mark.parametrize("policy", ["act", "memobench_mem"])
+def test_lerobots_own_checks_are_made_before_a_training(policy: str, word: str, named: str) -> None:
+    words = [f"policy={policy}", "device=cpu", word]
+    with pytest.raises(MemobenchError, match=named):
+        complete_training(read_words("train", parse_words(words)))
 
 
 def test_demonstrations_of_former_scenes_are_refused(tmp_path: Path) -> None:

@@ -25,9 +25,10 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS
 from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.sim.convention import convention_of
-from lerobot_memobench.training.configuration import check_environment
-from lerobot_memobench.training.features import detections
-from lerobot_memobench.training.view import Choice, viewed, write_view
+from lerobot_memobench.training.data import check_environment
+from lerobot_memobench.training.features import detected_slots
+from lerobot_memobench.training.trainer import prepare
+from lerobot_memobench.training.view import ViewOptions, write_view
 from tests.support.fake_loop import make_checkpoint
 
 NAMES = ("observation.images.image", "observation.images.image2")
@@ -47,7 +48,7 @@ def checkpoint(folder: Path, *cameras: str) -> Path:
 
 def test_a_view_keeps_the_convention(both: dict[str, Path], tmp_path: Path) -> None:
     for name, folder in both.items():
-        write_view(folder, tmp_path / name, Choice())
+        write_view(folder, tmp_path / name, ViewOptions())
         assert convention_of(read_info(tmp_path / name)["features"]) == name
     upright, libero = (LeRobotDataset("local/view", root=tmp_path / name)[4] for name in both)
     for here, there in zip(NAMES, VIEWS, strict=True):
@@ -60,7 +61,7 @@ def test_a_view_turns_videos_into_the_other_convention(
     both: dict[str, Path], tmp_path: Path, old: str, new: str
 ) -> None:
     """Equal to a dataset that was written in it, but for the second encoding."""
-    write_view(both[new], tmp_path / "wanted", Choice())
+    write_view(both[new], tmp_path / "wanted", ViewOptions())
     line = ["view", str(both[old]), "--convention", new, "--obs-type", "pixels_agent_pos"]
     assert memobench([*line, "--out", str(tmp_path / "turned")]) == 0
     wanted, turned = (LeRobotDataset("local/view", root=tmp_path / name) for name in ("wanted", "turned"))
@@ -105,8 +106,8 @@ def liberos(tmp_path: Path) -> Path:
 
 
 def test_a_view_turns_images_to_the_bit(liberos: Path, tmp_path: Path) -> None:
-    write_view(liberos, tmp_path / "upright", Choice(convention="upright"))
-    write_view(tmp_path / "upright", tmp_path / "back", Choice(convention="libero"))
+    write_view(liberos, tmp_path / "upright", ViewOptions(convention="upright"))
+    write_view(tmp_path / "upright", tmp_path / "back", ViewOptions(convention="libero"))
     first, upright, back = (
         LeRobotDataset("local/view", root=root) for root in (liberos, tmp_path / "upright", tmp_path / "back")
     )
@@ -126,10 +127,10 @@ def test_a_view_needs_pictures_of_a_known_convention(liberos: Path, tmp_path: Pa
     unknown = info.read_text().replace("images.image2", "images.wrist_image")
     for root, obs_type, named in ((objects, None, "no pictures"), (liberos, "environment_state_agent_pos", "has")):
         with pytest.raises(MemobenchError, match=named):
-            write_view(root, tmp_path / "view", Choice(obs_type=obs_type, convention="libero"))
+            write_view(root, tmp_path / "view", ViewOptions(obs_type=obs_type, convention="libero"))
     info.write_text(unknown)
     with pytest.raises(MemobenchError, match=r"it is unknown whether .*wrist_image are upright or mirrored"):
-        write_view(liberos, tmp_path / "view", Choice(convention="libero"))
+        write_view(liberos, tmp_path / "view", ViewOptions(convention="libero"))
     assert not (tmp_path / "view").exists()
 
 
@@ -174,7 +175,7 @@ def test_names_of_pictures_in_a_continued_training(
     words = [f"policy={path}", f"dataset={both['libero']}"]
 
     def renamed() -> Any:
-        return viewed(read_words("train", parse_words(words)).build(), None, None, lambda note: None).rename_map
+        return prepare(read_words("train", parse_words(words)).build(), None, None, lambda note: None).rename_map
 
     names = {
         f"observation.images.{old}": f"observation.images.camera{k + 1}" for k, old in enumerate(("image", "image2"))
@@ -190,7 +191,7 @@ def test_names_of_pictures_in_a_continued_training(
 
 def test_a_detector_reads_upright_pictures(both: dict[str, Path]) -> None:
     with pytest.raises(MemobenchError, match="a detector reads upright ones"):
-        detections(both["libero"], lambda *_: None, dict(zip(VIEWS, NAMES, strict=True)), "observation.state")  # type: ignore[arg-type]
+        detected_slots(both["libero"], lambda *_: None, dict(zip(VIEWS, NAMES, strict=True)), "observation.state")  # type: ignore[arg-type]
 
 
 def test_conformance_needs_the_checkpoints_convention(

@@ -69,5 +69,5 @@ def test_draws_are_numbered_across_epochs_and_resumes() -> None:
     draws = [draw for _ in range(3) for draw in whole]
     assert [number for _, number in draws] == list(range(27))
     resumed = frame_sampler(episodes, phase, None, seed=5, numbered=True)
-    resumed.go_on(step=7, batch_size=2, processes=1)
+    resumed.resume_from(step=7, batch_size=2, processes=1)
     assert list(resumed) == draws[13:18]

@@ -42,7 +42,7 @@ def test_single_frames_have_lerobots_order(used: list[int] | None) -> None:
 @pytest.mark.parametrize(("step", "batch_size", "processes"), [(3, 8, 1), (11, 8, 1), (25, 8, 1), (9, 4, 3)])
 def test_resumed_training_draws_the_rest_of_the_epoch(step: int, batch_size: int, processes: int) -> None:
     ours, whole = sampler(), sampler()
-    ours.go_on(step, batch_size, processes)
+    ours.resume_from(step, batch_size, processes)
     state = compute_sampler_state(step, len(whole), batch_size, processes)
     assert (ours.epoch, ours.offset) == (state["epoch"], state["start_index"])
     epochs = [list(whole) for _ in range(4)]
@@ -68,7 +68,7 @@ def test_held_frames_are_not_drawn(options: dict[str, Any]) -> None:
     assert ACTS[drawn].all()
     if "tasks" not in options:
         assert sorted(drawn) == np.flatnonzero(ACTS).tolist()
-    resumed.go_on(2, 4, 1)
+    resumed.resume_from(2, 4, 1)
     assert list(resumed) == drawn[8:]
 
 

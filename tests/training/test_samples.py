@@ -19,8 +19,8 @@ from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.training import command, samples
-from lerobot_memobench.training.samples import keep_in_memory, open_datasets
+from lerobot_memobench.training import trainer
+from lerobot_memobench.training.trainer import keep_in_memory, open_trainer_datasets
 
 STATE, SLOTS = "observation.state", "observation.environment_state"
 FEATURES = {STATE: PolicyFeature(FeatureType.STATE, (8,)), SLOTS: PolicyFeature(FeatureType.ENV, (208,))}
@@ -47,7 +47,7 @@ def test_samples_equal_lerobots(objects: Path, episodes: list[int] | None) -> No
 def opened(root: Path, features: dict[str, PolicyFeature] | None = None) -> tuple[TrainPipelineConfig, Any]:
     policy = make_policy_config("act", device="cpu", push_to_hub=False, input_features=features)
     config = TrainPipelineConfig(DatasetConfig("local/data", root=str(root)), policy=policy, num_workers=4)
-    return config, open_datasets(config)[0]
+    return config, open_trainer_datasets(config)[0]
 
 
 def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Path) -> None:
@@ -64,21 +64,22 @@ def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Pa
 
 def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(words: list[str], input: bytes, **_: Any) -> SimpleNamespace:
-        assert words[1:] == ["-m", samples.__name__, "--config_path=run"]
+        assert words[1:] == ["-m", trainer.__name__, "--config_path=run/pretrained_model"]
         monkeypatch.setattr("sys.stdin", io.StringIO(input.decode()))
-        samples.main()
+        trainer.main()
         return SimpleNamespace(returncode=0)
 
     received: list[TrainPipelineConfig] = []
     policy = make_policy_config("act", device="cpu", push_to_hub=False)
     config = TrainPipelineConfig(DatasetConfig("local/data"), policy=policy, steps=1, resume=True)
+    config.checkpoint_path = Path("run")
     monkeypatch.setattr(subprocess, "run", run)
-    monkeypatch.setattr(samples, "register_plugins", lambda: None)
+    monkeypatch.setattr(trainer, "register_plugins", lambda: None)
     monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
     monkeypatch.setattr(lerobot_train, "train", received.append)
-    assert command.run_lerobot(config, "run") == 0
+    assert trainer.run_lerobot(config) == 0
     assert (received[0].steps, received[0].policy) == (1, policy)
-    assert lerobot_train.make_train_eval_datasets is open_datasets
+    assert lerobot_train.make_train_eval_datasets is open_trainer_datasets
 
 
 @pytest.mark.parametrize(("policy", "plan"), [("vqbet", (5, 5)), ("gaussian_actor", (1, 1))])
@@ -87,8 +88,8 @@ def test_environments_of_a_training_get_the_plans_of_its_policy(
 ) -> None:
     """LeRobot's trainer opens them without the policy, and holds of strict tasks depend on its plans."""
     dataset = SimpleNamespace(meta=SimpleNamespace(camera_keys=["observation.images.image"]))
-    monkeypatch.setattr(samples, "make_train_eval_datasets", lambda config: (dataset, None))
+    monkeypatch.setattr(trainer, "make_train_eval_datasets", lambda config: (dataset, None))
     environment = MemobenchEnvConfig(suite="strict")
     config = make_policy_config(policy, device="cpu", push_to_hub=False)
-    open_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))
+    open_trainer_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))
     assert (environment.replan_steps, environment.window_steps) == plan

@@ -9,12 +9,13 @@ from typing import Any, cast
 
 import torch
 from accelerate import Accelerator
+from lerobot.configs.default import WandBConfig
 from lerobot.optim import load_optimizer_state, load_scheduler_state
 from lerobot.utils.random_utils import load_rng_state
 from torch import nn, optim
 
-from lerobot_memobench.training.log import LOSSES, TrainingLog, read_losses
-from lerobot_memobench.training.state import load_state, save_state
+from lerobot_memobench.training.loop import TrainingLog, load_state, save_state
+from tests.training.conftest import read_losses
 
 
 def made(updates: int) -> tuple[optim.Optimizer, Any]:
@@ -52,7 +53,7 @@ def test_state_is_restored_and_lerobot_reads_it(tmp_path: Path) -> None:
 
 
 def test_log_needs_no_wandb(tmp_path: Path) -> None:
-    config = SimpleNamespace(output_dir=tmp_path, batch_size=4, steps=2)
+    config = SimpleNamespace(output_dir=tmp_path, batch_size=4, steps=2, wandb=WandBConfig())
     dataset = SimpleNamespace(num_frames=40, num_episodes=2)
     log = TrainingLog(cast(Any, config), cast(Any, dataset), Accelerator(cpu=True), 0)
     log.note({"loss": 1.5, "grad_norm": 1.0, "lr": 0.1, "update_s": 0.01})
@@ -60,5 +61,5 @@ def test_log_needs_no_wandb(tmp_path: Path) -> None:
     log.write_evaluation(1, {"overall": {"avg_sum_reward": 0.0, "pc_success": 50.0, "eval_s": 1.0}})
     log.keep_model(tmp_path)
     log.close()
-    found = {row[2]: row[3] for row in read_losses(tmp_path / LOSSES)}
+    found = {row[2]: row[3] for row in read_losses(tmp_path)}
     assert (found["loss"], found["pc_success"]) == (1.5, 50.0)

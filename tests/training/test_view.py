@@ -17,8 +17,8 @@ from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.command_line import parse_words, read_words
-from lerobot_memobench.training.samples import keep_in_memory
-from lerobot_memobench.training.view import Choice, viewed, write_view
+from lerobot_memobench.training.trainer import keep_in_memory, prepare
+from lerobot_memobench.training.view import ViewOptions, write_view
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
 from tests.support.held_dataset import STRETCHES, make_held_dataset
 from tests.support.object_dataset import LENGTHS, PROMPTS
@@ -38,7 +38,7 @@ def inputs(root: Path) -> dict[str, FeatureType]:
 
 def test_view_holds_the_frames_after_the_prompt(pictured: Path, tmp_path: Path) -> None:
     """Pictures, state, action and time within the episode; chunks end with their episode."""
-    write_view(pictured, tmp_path / "view", Choice(obs_type=BOTH))
+    write_view(pictured, tmp_path / "view", ViewOptions(obs_type=BOTH))
     times = {"action": [0.0, 0.05, 0.1]}
     whole, view = opened(pictured, delta_timestamps=times), opened(tmp_path / "view", delta_timestamps=times)
     assert view.num_frames == sum(LENGTHS) - sum(PROMPTS)
@@ -61,7 +61,7 @@ def test_view_holds_the_frames_after_the_prompt(pictured: Path, tmp_path: Path) 
 def test_stretches_between_holds_are_episodes(tmp_path: Path) -> None:
     """Their chunks and windows end at the holds, pictures and texts stay those of the frames."""
     root = make_held_dataset(tmp_path / "held", pictures=True)
-    write_view(root, tmp_path / "view", Choice(obs_type=BOTH))
+    write_view(root, tmp_path / "view", ViewOptions(obs_type=BOTH))
     times = {"action": [0.0, 0.05, 0.1], STATE: [-0.05, 0.0]}
     whole, view = opened(root), opened(tmp_path / "view", delta_timestamps=times)
     assert view.num_episodes == len(STRETCHES)
@@ -96,7 +96,7 @@ def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     root = make_held_dataset(tmp_path / "held")
     words = ["policy=act", "policy.device=cpu", f"dataset={root}", "dataset.episodes=[1]"]
-    found = viewed(read_words("train", parse_words(words)).build(), None, None, print)
+    found = prepare(read_words("train", parse_words(words)).build(), None, None, print)
     assert found.dataset.episodes == [2, 3]
 
 
@@ -105,7 +105,7 @@ def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path, monkeypatch: p
     [(PIXELS, {STATE, PICTURE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, PICTURE})],
 )
 def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], pictured: Path, tmp_path: Path) -> None:
-    write_view(pictured, tmp_path / "view", Choice(obs_type=obs_type))
+    write_view(pictured, tmp_path / "view", ViewOptions(obs_type=obs_type))
     assert set(inputs(tmp_path / "view")) == seen
     stats = opened(tmp_path / "view").meta.stats
     assert seen <= set(stats)
@@ -115,7 +115,7 @@ def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], pictured
 
 def test_language_timestamps_move_with_their_frames(tmp_path: Path) -> None:
     root = write_streams(tmp_path / "streams", frames=9)
-    write_view(root, tmp_path / "view", Choice(obs_type=PIXELS))
+    write_view(root, tmp_path / "view", ViewOptions(obs_type=PIXELS))
     whole, view = opened(root), opened(tmp_path / "view")
     start = view.meta.episodes[1]["dataset_from_index"]
     of_whole = int(whole.meta.episodes[1]["dataset_to_index"] - view.meta.episodes[1]["length"])
@@ -129,7 +129,7 @@ def test_language_timestamps_move_with_their_frames(tmp_path: Path) -> None:
 def test_missing_observations_are_refused(synthetic: Path, objects: Path, tmp_path: Path) -> None:
     for root, obs_type in ((synthetic, OBJECTS), (objects, PIXELS), (objects, BOTH)):
         with pytest.raises(MemobenchError, match=f"obs_type={obs_type}"):
-            write_view(root, tmp_path / "view", Choice(obs_type=obs_type))
+            write_view(root, tmp_path / "view", ViewOptions(obs_type=obs_type))
     assert not (tmp_path / "view").exists()
 
 
@@ -138,12 +138,12 @@ def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pyt
     given = read_words("train", parse_words(["policy=act", "policy.device=cpu", f"dataset={pictured}"])).build()
     notes: list[str] = []
     for _ in range(2):
-        found = viewed(given, None, OBJECTS, notes.append)
+        found = prepare(given, None, OBJECTS, notes.append)
     folder = Path(str(found.dataset.root))
     assert set(inputs(folder)) == {STATE, SLOTS}
     assert not [note for note in notes if "pixels" in note]
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
-    kept = viewed(given, True, None, notes.append)
+    kept = prepare(given, True, None, notes.append)
     assert "observation.phase" not in str(kept.policy.input_features)
     assert "observation.images.image" in str(kept.policy.input_features)
     (note,) = (note for note in notes if "pixels" in note)
@@ -151,7 +151,7 @@ def test_trainings_share_a_view(pictured: Path, tmp_path: Path, monkeypatch: pyt
     assert "evaluate it with observation_height=48 observation_width=48" in note
     given.dataset.episodes = [7]
     with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
-        viewed(given, None, None, notes.append)
+        prepare(given, None, None, notes.append)
 
 
 def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,5 +179,5 @@ def test_inputs_that_a_policy_cannot_have_are_refused(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     given = read_words("train", parse_words([*words, "policy.device=cpu", f"dataset={synthetic}"])).build()
     with pytest.raises(MemobenchError, match=named):
-        viewed(given, None, None, print)
+        prepare(given, None, None, print)
     assert not [*tmp_path.rglob("info.json")]

@@ -20,8 +20,8 @@ logger = logging.getLogger(__name__)
 
 SHIPPED = Path(__file__).parent / "detector.safetensors"
 """The detector that comes with the package, trained on the scenes that version 0.2 modelled in code."""
-PACKAGE, RANDOM = "package", "random"
-"""Names that do not mean a file: the package's detector, and a visual encoder with random weights."""
+PACKAGE = "package"
+"""Name of the package's detector."""
 
 
 def save_detector(detector: Detector, path: Path) -> None:
@@ -46,7 +46,7 @@ def load_detector(name: str | Path) -> Detector:
             shape = json.loads(file.metadata()["detector"])
             detector = Detector(VisualEncoder(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
             detector.fold()
-            # Files of earlier versions also hold heads that only training used.
+            # The package's file also holds heads that only its training used.
             detector.load_state_dict({key: file.get_tensor(key).float() for key in detector.state_dict()})
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]

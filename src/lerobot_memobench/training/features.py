@@ -14,9 +14,8 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -57,8 +56,6 @@ FOLDER = "feature_cache"
 TOKENS = "tokens"
 """Name of the tensor (n, P, D) in each file."""
 MOST_THREADS = 8
-BYTES = 2
-"""Of a bfloat16 number."""
 _SAMPLE = 1 << 16
 """Bytes of a video that are hashed at each of its start, middle and end."""
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
@@ -66,25 +63,17 @@ Progress = Callable[[int, int], None]
 """Called as progress(completed episodes, all episodes)."""
 
 
-@dataclass(frozen=True)
-class Features:
+class Features(NamedTuple):
     """An encoder of frames.
 
     Attributes:
-        key: identity of the encoder: weights and input size.
-        tokens_per_frame: P. dim: D.
+        key: identity of the encoder: weights and input size. size: numbers of a frame.
         make: maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
     """
 
     key: str
-    tokens_per_frame: int
-    dim: int
+    size: int
     make: Callable[..., Tensor]
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a stored frame: 64 KiB at full size."""
-        return BYTES * self.tokens_per_frame * self.dim
 
 
 class EpisodeFeatures:
@@ -157,7 +146,7 @@ def make_features(
         notify: called with the folder and its size before anything is encoded.
 
     Raises:
-        MemobenchError: ``root`` is not a dataset, lacks the camera, or the disk is full.
+        MemobenchError: the dataset lacks the camera, or the disk is full.
     """
     folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
     progress = progress or functools.partial(logger.info, "feature cache: %d of %d episodes")
@@ -167,7 +156,7 @@ def make_features(
     if not missing:
         return EpisodeFeatures(folder, table.episodes, stride)
     read = read or frame_reader(root, camera)
-    needed, free = int(counts[missing].sum()) * features.frame_bytes, free_bytes(folder)
+    needed, free = int(counts[missing].sum()) * features.size * torch.bfloat16.itemsize, free_bytes(folder)
     notify(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
     if needed > free:
         raise MemobenchError(
@@ -200,15 +189,7 @@ def _keep_from_the_hub(root: Path) -> None:
 
 
 def dataset_fingerprint(root: Path, camera: str) -> str:
-    """Hash the frame tables in full, and the camera's videos by their size and three samples each.
-
-    Raises:
-        MemobenchError: ``root`` is not a LeRobotDataset.
-    """
-    if not (root / "meta" / "info.json").is_file():
-        raise MemobenchError(
-            f"{root} is not a LeRobotDataset (meta/info.json is missing); name the folder of meta, data and videos"
-        )
+    """Hash the frame tables in full, and the camera's videos by their size and three samples each."""
     digest = hashlib.blake2b(digest_size=12)
     for path in files_below(root / "data", ".parquet"):
         digest.update(str(path.relative_to(root)).encode())
@@ -231,7 +212,7 @@ def cameras_of(features: Mapping[str, Any]) -> list[str]:
 # -- features of each kind of policy -----------------------------------------------------------------------------------
 
 
-SMALL = Features(THUMBNAILS, 1, THUMBNAIL**2, thumbnails)
+SMALL = Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
 """Grey thumbnails, for a memory of motion."""
 
 
@@ -243,12 +224,14 @@ def remembered_features(
     Args:
         camera: the dataset's name of the remembered camera. how: of `make_features`.
     """
-    prefix, features = f"{config.size}-stride{config.memory_stride}", SMALL
-    if config.remembers_thumbnails:
-        prefix = f"thumbnails-stride{config.memory_stride}"
-    else:
-        features = Features(encoder.key, encoder.tokens_per_frame, encoder.dim, encoder)
-    return make_features(root, prefix, features, camera=camera, stride=config.memory_stride, **how)
+    features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
+    return _memory_features(root, config, features, camera=camera, **how)
+
+
+def _memory_features(root: Path, config: MemobenchMemConfig, pooled: Features, **how: Any) -> EpisodeFeatures:
+    stride = config.memory_stride
+    kind, features = ("thumbnails", SMALL) if config.remembers_thumbnails else (config.size, pooled)
+    return make_features(root, f"{kind}-stride{stride}", features, stride=stride, **how)
 
 
 def picture_tokens(
@@ -264,21 +247,18 @@ def picture_tokens(
     Returns:
         The memory's features, None without a memory, and those of present pictures by the policy's name of the camera.
     """
-    whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
+    whole = Features(encoder.present_key, GRID**2 * WIDTH, encoder.encode)
     prefix = f"{config.size}-present"
     present = {name: make_features(root, prefix, whole, camera=of, **how) for name, of in cameras.items()}
     if config.memory == "none":
         return None, present
-    stride, remembered = config.memory_stride, encoder.memory_input
-    where: dict[str, Any] = {"camera": cameras[remembered], "stride": stride, **how}
-    if config.remembers_thumbnails:
-        return make_features(root, f"thumbnails-stride{stride}", SMALL, **where), present
-    pooled = Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
-    read = present[remembered].tokens
-    return make_features(root, f"{config.size}-stride{stride}", pooled, read=read, **where), present
+    remembered = encoder.memory_input
+    pooled = Features(encoder.key, encoder.tokens_per_frame * WIDTH, encoder.pooled)
+    read = None if config.remembers_thumbnails else present[remembered].tokens
+    return _memory_features(root, config, pooled, camera=cameras[remembered], read=read, **how), present
 
 
-def detections(
+def detected_slots(
     root: Path, detect: ObjectsFromPictures, cameras: dict[str, str], state: str, **how: Any
 ) -> EpisodeFeatures:
     """Make a detector's object slots for every frame.
@@ -304,7 +284,7 @@ def detections(
         rounded = slots.to(torch.bfloat16)
         return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
 
-    features = Features(detect.key, 2, SIZE, make)
+    features = Features(detect.key, 2 * SIZE, make)
     return make_features(root, "objects", features, camera=next(iter(cameras.values())), read=read, **how)
 
 
@@ -371,7 +351,7 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     config.memory_camera = config.memory_camera or next(iter(cameras), None)
     if config.detector is not None:
         detect = ObjectsFromPictures(load_detector(config.detector))
-        return detections(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
+        return detected_slots(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
     camera = config.memory_camera or ""
     if config.uses_visual_encoder:
         encoder = load_token_encoder(config, weights)

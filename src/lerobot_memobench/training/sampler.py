@@ -69,7 +69,7 @@ class FrameSampler:
             return grouped_order(self.ends, self.together, generator)
         return torch.randperm(len(self), generator=generator)
 
-    def go_on(self, step: int, batch_size: int, processes: int) -> None:
+    def resume_from(self, step: int, batch_size: int, processes: int) -> None:
         """Continue after so many updates with a batch size per process."""
         per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate pads the last batches
         self.epoch, batches = divmod(step, per_epoch)
