@@ -16,7 +16,7 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem as modeling
 from lerobot_memobench.training.data import DecodedSamples
-from lerobot_memobench.training.sampler import frame_sampler
+from lerobot_memobench.training.sampler import FrameSampler
 
 PICTURE = "observation.images.image"
 
@@ -65,9 +65,9 @@ def test_augmentation_follows_seed_and_draw(synthetic: Path) -> None:
 
 def test_draws_are_numbered_across_epochs_and_resumes() -> None:
     episodes, phase = np.array([0, 4, 9]), np.ones(9, int)
-    whole = frame_sampler(episodes, phase, None, seed=5, numbered=True)
+    whole = FrameSampler(episodes, phase, None, seed=5, numbered=True)
     draws = [draw for _ in range(3) for draw in whole]
     assert [number for _, number in draws] == list(range(27))
-    resumed = frame_sampler(episodes, phase, None, seed=5, numbered=True)
+    resumed = FrameSampler(episodes, phase, None, seed=5, numbered=True)
     resumed.resume_from(step=7, batch_size=2, processes=1)
     assert list(resumed) == draws[13:18]

@@ -16,7 +16,7 @@ from lerobot.datasets.sampler import compute_sampler_state
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.training.data import execution_statistics, open_datasets, open_training
 from lerobot_memobench.training.loop import make_held_out_loader, make_sampler
-from lerobot_memobench.training.sampler import frame_sampler, grouped_order, weighted_order
+from lerobot_memobench.training.sampler import FrameSampler, grouped_order, weighted_order
 from tests.support.held_dataset import HELD, LENGTHS, PROMPTS, STRETCHES, make_held_dataset
 from tests.support.small_policy import small_config
 
@@ -27,7 +27,7 @@ ACTS[: PROMPTS[0]] = False
 
 
 def sampler(**options: Any) -> Any:
-    return frame_sampler(EPISODES, PHASE, options.pop("used", None), seed=5, **options)
+    return FrameSampler(EPISODES, PHASE, options.pop("used", None), seed=5, **options)
 
 
 @pytest.mark.parametrize("used", [None, [2, 1]])
@@ -52,7 +52,7 @@ def test_resumed_training_draws_the_rest_of_the_epoch(step: int, batch_size: int
 
 def test_dataset_without_execution_is_refused() -> None:
     with pytest.raises(MemobenchError, match="execution frame"):
-        frame_sampler(EPISODES, np.zeros(94, int), None)
+        FrameSampler(EPISODES, np.zeros(94, int), None)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_dataset_without_execution_is_refused() -> None:
 )
 def test_held_frames_are_not_drawn(options: dict[str, Any]) -> None:
     def made() -> Any:
-        return frame_sampler(np.cumsum([0, *LENGTHS]), ACTS, None, seed=5, **options)
+        return FrameSampler(np.cumsum([0, *LENGTHS]), ACTS, None, seed=5, **options)
 
     whole, resumed = made(), made()
     drawn = list(whole)

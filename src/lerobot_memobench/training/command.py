@@ -64,8 +64,6 @@ OBJECT_BATCH = 72
 """Default frames per update of a policy whose samples are in main memory: a dozen episodes, six frames of each."""
 SHORT_TRAINING = 2000
 """Updates below which losses are logged ten times; LeRobot's default of every 200 updates would log too few."""
-TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
-"""Settings that name the model to train."""
 SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
 """Setting -> its smallest value; LeRobot checks none of them."""
 READ = frozenset(
@@ -78,6 +76,7 @@ READ = frozenset(
     }
 )
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
+TRAINING_STEP = Path("training_state") / "training_step.json"
 OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
 """Beginnings of settings that a saved optimizer overrides."""
 NOT_COMPARED = {
@@ -87,12 +86,7 @@ NOT_COMPARED = {
 
 
 def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
-    """Run ``lerobot train``; return the exit status.
-
-    Args:
-        words: of the command line (`run.command_line.parse_words`).
-        notify: called with notes.
-    """
+    """Run ``lerobot train`` by the words of `run.command_line.parse_words`; return the exit status."""
     prompt_frames, obs_type, rest = take_training_options(resolve_recipe(with_last_checkpoint(words)))
     asked = read_words("train", rest)
     if HELP in words:
@@ -126,12 +120,9 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
 
 @contextmanager
 def locked_run(config: TrainPipelineConfig) -> Iterator[None]:
-    """Lock the folder of a training, in its first process.
+    """Lock the folder of a training, in its first process; refuse it if another training holds the lock.
 
     The lock is a file next to the folder, because LeRobot refuses a folder that exists before its first checkpoint.
-
-    Raises:
-        MemobenchError: another training holds the lock.
     """
     assert config.output_dir is not None
     if os.environ.get("RANK", "0") != "0":
@@ -179,7 +170,7 @@ def complete_training(asked: CommandSettings, notify: Callable[[str], None] = pr
         MemobenchError: no policy is named, settings do not go together, the dataset or the checkpoint cannot be used,
             or a resumed training has other settings.
     """
-    if not any(asked.get(key) for key in TRAINED):
+    if not (asked.get("policy") or asked.get("reward_model")):
         raise MemobenchError("name a policy: policy=memobench_mem")
     asked = asked.default("dataset.repo_id", DEFAULT_REPO_ID)
     if asked.get("policy") and asked.get("policy.repo_id") is None:  # LeRobot would require one
@@ -222,10 +213,7 @@ def complete_training(asked: CommandSettings, notify: Callable[[str], None] = pr
 
 
 def build_training(asked: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
-    """Return the settings and the configuration.
-
-    Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
-    """
+    """Return settings and configuration; settings of a checkpoint that have no effect under them get their defaults."""
     try:
         return asked, asked.build()
     except MemobenchError as error:
@@ -373,11 +361,7 @@ def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
 
 
 def last_checkpoint(run: Path) -> Path:
-    """Return the folder ``pretrained_model`` of the last complete checkpoint of a run.
-
-    Raises:
-        MemobenchError: there is none.
-    """
+    """Return the folder ``pretrained_model`` of the last complete checkpoint of a run; raise if there is none."""
     for folder in complete_checkpoints(run):
         return folder / "pretrained_model"
     problem = "holds no complete checkpoint" if run.is_dir() else "does not exist"
@@ -390,28 +374,19 @@ def last_checkpoint(run: Path) -> Path:
 def complete_checkpoints(run: Path) -> Iterator[Path]:
     """Yield the complete checkpoints of a run, the last one first."""
     for folder in checkpoints_of(run):
-        described = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and step_file(folder).is_file()
+        described = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
         # LeRobot sets the link when a checkpoint is complete; it writes the optimizer's groups nearly last.
         if described and (folder.name == LAST or any(folder.glob("training_state/**/optimizer_param_groups.json"))):
             yield folder
 
 
-def step_file(checkpoint: Path) -> Path:
-    """Return LeRobot's file of the step at which a checkpoint was saved."""
-    return checkpoint / "training_state" / "training_step.json"
-
-
 def step_reached(checkpoint: Path) -> int:
     """Return the step at which a checkpoint was saved."""
-    return int(read_json(step_file(checkpoint))["step"])
+    return int(read_json(checkpoint / TRAINING_STEP)["step"])
 
 
 def make_room_for_link(last: Path) -> None:
-    """Remove a file that a copy made of the link ``last`` of a training, because LeRobot makes the link.
-
-    Raises:
-        MemobenchError: ``last`` is a folder, or another file.
-    """
+    """Remove a file that a copy made of the link ``last`` of a training, because LeRobot makes the link."""
     if last.is_symlink() or not last.exists():
         return
     named = text_of_link(last)
@@ -426,14 +401,7 @@ def make_room_for_link(last: Path) -> None:
 def check_same_training(
     asked: CommandSettings, config: TrainPipelineConfig, checkpoint: Path, notify: Callable[[str], None]
 ) -> None:
-    """Refuse to resume a training with another dataset, or with settings that it cannot change; note the others.
-
-    Args:
-        config: the configuration of `asked`. checkpoint: folder of model and state.
-
-    Raises:
-        MemobenchError: a setting differs.
-    """
+    """Refuse to resume a training with another dataset, or with settings that it cannot change; note the others."""
     begun, model = asked.begun, checkpoint / "pretrained_model"
     another = f"train a new run from the checkpoint: policy={model} output_dir=<new folder>"
     check_processors(model)
@@ -483,12 +451,9 @@ def _check_same_dataset(found: Any, begun: Any, another: str) -> None:
 
 
 def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str | None:
-    """Return a note if another number of steps makes the learning rate of a resumed training jump.
+    """Return a note if another number of steps makes the learning rate of a resumed training jump at the step reached.
 
-    LeRobot builds the schedule for the new number and continues in it at the step that was reached.
-
-    Args:
-        steps: the new number. done: the step that was reached.
+    LeRobot builds the schedule for the new number and continues in it at that step.
     """
     from torch import nn, optim
 
@@ -508,11 +473,7 @@ def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str |
 
 
 def resume_hint(config: TrainPipelineConfig, words: Mapping[str, str]) -> str:
-    """Return the advice for a training that was terminated: the command that resumes from its last checkpoint.
-
-    Args:
-        words: of its command line.
-    """
+    """Return the advice for a training that was terminated: the command that resumes from its last checkpoint."""
     assert config.output_dir is not None
     if not any(complete_checkpoints(config.output_dir)):
         return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *spelled(words)])}"

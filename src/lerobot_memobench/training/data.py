@@ -84,10 +84,8 @@ class Training:
     """A policy and its training data.
 
     Attributes:
-        policy: possibly with adapters. processors: pre- and postprocessor.
-        dataset: the episodes to train on. held_out: the held-out episodes, or None.
-        lookup: all frames of the dataset.
-        seed: of augmentations.
+        policy: possibly with adapters. processors: pre- and postprocessor. dataset: the episodes to train on.
+        lookup: all frames of the dataset. seed: of augmentations.
     """
 
     policy: Any
@@ -109,9 +107,6 @@ class Training:
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
     """Make or load the policy of a training, compute missing features, and make the processors.
-
-    Args:
-        datasets: of `open_datasets`.
 
     Raises:
         MemobenchError: the dataset does not fit the policy.
@@ -174,11 +169,7 @@ def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata)
 
 
 def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
-    """Add missing statistics that a policy needs for normalisation to its dataset.
-
-    Args:
-        policy: its configuration. given: LeRobot's configuration of the dataset.
-    """
+    """Add missing statistics that a policy needs for normalisation to the dataset of LeRobot's ``DatasetConfig``."""
     root = Path(meta.root)
     missing = lacking(root, needed_by(policy, meta.features, given.use_imagenet_stats))
     if not missing:
@@ -201,11 +192,7 @@ def with_features(policy: Any, features: dict[str, Any]) -> Any:
 
 
 def check_convention(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
-    """Refuse to continue a checkpoint's training on pictures of another convention.
-
-    Args:
-        features: of the dataset.
-    """
+    """Refuse to continue a checkpoint's training on a dataset with pictures of another convention."""
     policy, stated = config.policy, convention_of(features)
     if policy is None or policy.pretrained_path is None or config.resume or stated is None or not policy.image_features:
         return
@@ -222,9 +209,6 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
     """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
 
     The environment receives the plans of the policy, on which holds depend.
-
-    Args:
-        features: of the dataset.
     """
     check_convention(config, meta, features)
     if config.policy is None or getattr(config.env, "type", None) != "memobench":
@@ -248,11 +232,7 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
 def open_lookup(
     root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
 ) -> FrameLookup:
-    """Open the lookup of a dataset's frames; compute missing features first.
-
-    Args:
-        encoder: the policy's perception.
-        renamed: LeRobot's ``rename_map``: names of the dataset -> names of the policy.
+    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first.
 
     Raises:
         MemobenchError: the dataset lacks a column, or features cannot be computed.

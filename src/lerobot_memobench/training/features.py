@@ -77,11 +77,7 @@ class Features(NamedTuple):
 
 
 class EpisodeFeatures:
-    """Stored features of every ``stride``-th frame of each episode, read through memory maps.
-
-    Args:
-        episodes: (E + 1,) first frame of each episode.
-    """
+    """Stored features of every ``stride``-th frame of each episode, read through memory maps."""
 
     def __init__(self, folder: Path, episodes: np.ndarray, stride: int) -> None:
         self.folder, self._episodes, self._stride = folder, episodes, stride
@@ -219,11 +215,7 @@ SMALL = Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
 def remembered_features(
     root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, camera: str, **how: Any
 ) -> EpisodeFeatures:
-    """Make the memory's features for a policy with an image tower: pooled tokens, or thumbnails.
-
-    Args:
-        camera: the dataset's name of the remembered camera. how: of `make_features`.
-    """
+    """Make the memory's features for a policy with an image tower: pooled tokens, or thumbnails."""
     features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
     return _memory_features(root, config, features, camera=camera, **how)
 
@@ -242,10 +234,7 @@ def picture_tokens(
     Pooled tokens are computed from the present ones, so that no video is decoded twice.
 
     Args:
-        cameras: the policy's name of each camera -> the dataset's. how: of `make_features`.
-
-    Returns:
-        The memory's features, None without a memory, and those of present pictures by the policy's name of the camera.
+        cameras: the policy's name of each camera -> the dataset's. The present features have the policy's names.
     """
     whole = Features(encoder.present_key, GRID**2 * WIDTH, encoder.encode)
     prefix = f"{config.size}-present"
@@ -267,7 +256,6 @@ def detected_slots(
 
     Args:
         cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
-        how: of `make_features`.
     """
     if convention_of(read_info(root)["features"]) == MIRRORED:
         raise MemobenchError(f"{root} has pictures of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
@@ -297,15 +285,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
     Args:
         weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
             random weights of a fixed seed.
-
-    Raises:
-        MemobenchError: the weights cannot be read or do not fit, or the policy has no tower.
     """
-    if config.uses_objects:
-        raise MemobenchError(
-            "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
-            "this command, or name a detector"
-        )
     with torch.device("meta"):
         model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
@@ -321,7 +301,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
 
 
 def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = None) -> VisualTokenEncoder:
-    """Load ``config``'s visual encoder alone; arguments and errors as of `load_image_tower`."""
+    """Load ``config``'s visual encoder alone, as `load_image_tower`."""
     source = weights or config.base_weights
     if source is None:
         assert config.visual_encoder is not None  # the configuration has one
@@ -334,12 +314,10 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
 
 
 def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path | None = None, **how: Any) -> Path:
-    """Make or complete the features of a dataset for a policy.
+    """Make or complete the features of a dataset for a policy, for example ``MemobenchMemConfig(size="tiny")``.
 
     Args:
-        config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
-        weights: checkpoint with the image tower or visual encoder, see `load_image_tower`.
-        how: of `make_features`.
+        weights: of `load_image_tower`. how: of `make_features`.
 
     Returns:
         Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder the memory's folder.
@@ -352,6 +330,11 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     if config.detector is not None:
         detect = ObjectsFromPictures(load_detector(config.detector))
         return detected_slots(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
+    if config.uses_objects:
+        raise MemobenchError(
+            "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
+            "this command, or name a detector"
+        )
     camera = config.memory_camera or ""
     if config.uses_visual_encoder:
         encoder = load_token_encoder(config, weights)

@@ -47,7 +47,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import read_json
 from lerobot_memobench.training.average import WeightAverage, begin_average
 from lerobot_memobench.training.data import Training, check_environment, open_datasets, open_training
-from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, seed_of, task_weights
+from lerobot_memobench.training.sampler import FrameSampler, seed_of, task_weights
 
 logger = logging.getLogger(__name__)
 
@@ -57,11 +57,7 @@ DISTRIBUTED = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MU
 
 
 def train(config: TrainPipelineConfig) -> None:
-    """Train a memory policy until ``config.steps``, from the beginning or from ``config.checkpoint_path``.
-
-    Args:
-        config: complete, as of `command.complete_training`.
-    """
+    """Train a memory policy by a configuration of `command.complete_training`."""
     accelerator = begin(config)
     with accelerator.main_process_first():  # the others find the dataset downloaded
         datasets = open_datasets(config)
@@ -146,11 +142,7 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
 
 @dataclass
 class TrainingState:
-    """What a training changes, and its accelerate handle.
-
-    Attributes:
-        model: the policy as accelerate wraps it. average: of its weights; None if there is none.
-    """
+    """Model, as accelerate wraps it, weight average, optimizer and schedule of a training."""
 
     config: TrainPipelineConfig
     accelerator: Accelerator
@@ -280,7 +272,7 @@ def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSample
     policy, lookup, dataset = training.policy.config, training.lookup, training.dataset
     weights = policy.task_weights
     tasks = None if weights is None else task_weights(dataset.meta, lookup.episodes, lookup.phase, weights)
-    return frame_sampler(
+    return FrameSampler(
         lookup.episodes,
         lookup.acts,
         dataset.episodes,
@@ -321,7 +313,7 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
     """
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
-    frames = frame_sampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
+    frames = FrameSampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
     if config.max_eval_samples > 0:
         tasks, rows = dataset.hf_dataset.data.column("task_index").to_pylist(), dataset.absolute_to_relative_idx
         of_task: dict[int, list[int]] = {}
@@ -344,7 +336,6 @@ def save_state(checkpoint: Path, progress: dict[str, int], optimizer: Any, sched
 
     Args:
         progress: ``step`` and, per update, ``batch_size`` of a process and ``num_processes``.
-        scheduler: of the learning rate, or None.
     """
     folder = checkpoint / TRAINING_STATE_DIR
     folder.mkdir(parents=True, exist_ok=True)
@@ -359,9 +350,6 @@ def load_state(checkpoint: Path, optimizer: Any, scheduler: Any) -> dict[str, in
     """Restore optimizer and schedule of a checkpoint; return its ``progress``.
 
     The random state is not restored: each update sets its own (`train`).
-
-    Raises:
-        MemobenchError: the checkpoint's step cannot be read.
     """
     folder = checkpoint / TRAINING_STATE_DIR
     progress = read_json(folder / TRAINING_STEP)

@@ -64,7 +64,6 @@ def prepare(
     Args:
         prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
         obs_type: kind of observation; None: pictures if the dataset has them, else objects.
-        notify: called with the view's folder.
 
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.

@@ -265,7 +265,7 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
 
 
 def _mirrored(frames: pa.Table) -> pa.Table:
-    """Return frames with LeRobot's images in them mirrored left to right, as PNG."""
+    """Return frames with LeRobot's images mirrored left to right, as PNG."""
     for place, field in enumerate(frames.schema):
         if field.name.startswith(OBS_IMAGES) and pa.types.is_struct(field.type):
             rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(place).to_pylist()]
