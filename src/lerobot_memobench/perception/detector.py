@@ -132,7 +132,7 @@ class FeaturePyramid(nn.Module):
         self.levels = nn.ModuleList(PyramidLevel(*pair) for pair in pairwise(widths))
 
     def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
-        """Return (N, (GRID FINER)², width), row by row, of tokens (N, 64, encoder's width) and feature maps."""
+        """Return (N, (GRID FINER)², width), row by row."""
         x = tokens.unflatten(1, (GRID, GRID))
         for level, lateral in zip(self.levels, reversed(maps), strict=False):
             x = level(x, lateral)
@@ -159,8 +159,7 @@ class Heads(nn.Module):
     """Linear maps from tokens, or cells of a map, to a `DetectorOutput`.
 
     Args:
-        width: of a token. kinds: number of kinds of objects. grid: side of the square of tokens.
-        fine, coarse: cells along a token's side. uncertain: predict the geometry's expected errors too.
+        width: of a token. grid: side of the square of tokens. fine, coarse: cells along a token's side.
     """
 
     def __init__(
@@ -222,12 +221,7 @@ class RefinementHead(nn.Module):
         self.score = nn.Linear(REFINEMENT_WIDTH, kinds)
 
     def forward(self, fine: Tensor, maps: Tensor, heatmap: Tensor) -> CellQuery:
-        """Return a query of scores: a logit per kind of an object in a cell of the finest map.
-
-        Args:
-            fine: (N, side², width) the finest map. maps: (N, channels, 2 side, 2 side) the encoder's.
-            heatmap: (N, kinds, side, side) logits.
-        """
+        """Return a query of scores: a logit per kind of an object in a cell of the finest map (N, side², width)."""
         grid = fine.unflatten(1, heatmap.shape[-2:]).permute(0, 3, 1, 2)
 
         def query(image: Tensor, _: Tensor, row: Tensor, column: Tensor) -> Tensor:

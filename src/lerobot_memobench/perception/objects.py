@@ -68,20 +68,13 @@ LEAST_ERROR = 0.0005
 
 def views_of(state: NDArray[np.floating]) -> dict[str, View]:
     """Return the views of both cameras for a robot state (>= 6,): the hand's position and axis-angle rotation."""
-    return {camera: view_of(camera, state) for camera in ANGLES}
-
-
-def view_of(camera: str, state: NDArray[np.floating]) -> View:
-    """Return the view of a camera (`agentview` or `wrist`) for a robot state, see `views_of`."""
-    slope = np.tan(np.radians(ANGLES[camera]) / 2)
-    if camera == "agentview":
-        turned = Rotation.from_quat(AGENTVIEW_QUATERNION, scalar_first=True).as_matrix()
-        return {"eye": np.array(AGENTVIEW_POSITION), "turned": turned, "slope": slope}
+    slope = {camera: np.tan(np.radians(angle) / 2) for camera, angle in ANGLES.items()}
+    fixed = Rotation.from_quat(AGENTVIEW_QUATERNION, scalar_first=True).as_matrix()
     hand = Rotation.from_rotvec(np.asarray(state[3:6], np.float64)).as_matrix()
+    eye = state[:3] + hand @ np.array(WRIST_POSITION)
     return {
-        "eye": state[:3] + hand @ np.array(WRIST_POSITION),
-        "turned": hand @ np.array(WRIST_ROTATION),
-        "slope": slope,
+        "agentview": {"eye": np.array(AGENTVIEW_POSITION), "turned": fixed, "slope": slope["agentview"]},
+        "wrist": {"eye": eye, "turned": hand @ np.array(WRIST_ROTATION), "slope": slope["wrist"]},
     }
 
 
@@ -150,10 +143,7 @@ class DetectedObject:
 
 
 class ObjectLocalizer:
-    """Detect objects in both cameras' images and place them in the world.
-
-    Kinds that this version does not know are ignored.
-    """
+    """Detect objects in both cameras' images and place them in the world; kinds without a class are ignored."""
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector

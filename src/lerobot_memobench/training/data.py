@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import FeatureType
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import get_feature_stats
@@ -39,6 +40,7 @@ from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, check_revision, list_episodes
 from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
+from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -132,40 +134,37 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
         MemobenchError: the dataset lacks an episode, or an earlier version made it.
     """
     opened = copy.copy(config)
-    if config.dataset.root is not None:
-        opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
-    given = opened.dataset
-    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
-    check_episodes(given.episodes, meta)
-    complete_statistics(config.policy, meta, given)
+    opened.dataset = replace(config.dataset)
+    complete_statistics(config.policy, open_metadata(opened.dataset), opened.dataset)
     train, held_out = make_train_eval_datasets(opened)
-    check_dataset_version(train.meta)
     return train, held_out
 
 
-def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset that an earlier version of the benchmark made: of other scenes, goals, prompts or holds."""
+def open_metadata(given: DatasetConfig) -> LeRobotDatasetMetadata:
+    """Return the metadata of a training's dataset.
+
+    Raises:
+        MemobenchError: an earlier version of the benchmark made it, of other scenes, goals, prompts or holds; or it
+            lacks an episode, which LeRobot ignores, so that it fails if no episode is left.
+    """
+    if given.root is not None:
+        given.root = str(without_pattern(Path(given.root)))
+    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
     check_clock(meta.features, meta.root)
-    if EPISODE_INFO not in meta.features:
-        return
-    places = list_episodes(Path(meta.root))
-    for place in places:
-        if place.record is not None:
-            check_world(place.record.world, f"episode {place.index} of {meta.root}")
-    check_revision(Path(meta.root), places)
-
-
-def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse episodes that a dataset lacks; LeRobot ignores them, and fails if no episode is left."""
-    if episodes is None:
-        return
-    absent = [episode for episode in episodes if episode >= meta.total_episodes]
-    if absent or not episodes:
+    if EPISODE_INFO in meta.features:
+        places = list_episodes(Path(meta.root))
+        for place in places:
+            if place.record is not None:
+                check_world(place.record.world, f"episode {place.index} of {meta.root}")
+        check_revision(Path(meta.root), places)
+    absent = [episode for episode in given.episodes or () if episode >= meta.total_episodes]
+    if absent or given.episodes == []:
         raise MemobenchError(
-            f"found episodes={absent or episodes}, and the dataset {meta.root} has "
+            f"found episodes={absent or given.episodes}, and the dataset {meta.root} has "
             f"{count_of(meta.total_episodes, 'episode')}; choose from 0 to {meta.total_episodes - 1}, or leave "
             "episodes out for all"
         )
+    return meta
 
 
 def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
@@ -191,39 +190,34 @@ def with_features(policy: Any, features: dict[str, Any]) -> Any:
     return made
 
 
-def check_convention(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
-    """Refuse to continue a checkpoint's training on a dataset with pictures of another convention."""
-    policy, stated = config.policy, convention_of(features)
-    if policy is None or policy.pretrained_path is None or config.resume or stated is None or not policy.image_features:
-        return
-    found, why = trained_convention(str(policy.pretrained_path), policy)
-    if found not in (None, stated):
-        raise MemobenchError(
-            f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
-            f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} --out "
-            "<folder>`"
-        )
-
-
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
-    """Refuse evaluations on the benchmark during a training on other cameras, sizes or conventions of pictures.
+    """Refuse pictures of another convention than a continued checkpoint's, and evaluations on other pictures.
 
-    The environment receives the plans of the policy, on which holds depend.
+    The environment of evaluations during a training receives the plans of the policy, on which holds depend.
     """
-    check_convention(config, meta, features)
-    if config.policy is None or getattr(config.env, "type", None) != "memobench":
+    policy, env, stated = config.policy, config.env, convention_of(features)
+    if policy is None:
         return
-    env: Any = config.env
-    if (stated := convention_of(features)) not in (None, env.convention) and env.obs_type != OBJECTS:
+    if stated is not None and policy.pretrained_path is not None and not config.resume and policy.image_features:
+        found, why = trained_convention(str(policy.pretrained_path), policy)
+        if found not in (None, stated):
+            raise MemobenchError(
+                f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
+                f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} "
+                "--out <folder>`"
+            )
+    if not isinstance(env, MemobenchEnvConfig):
+        return
+    if stated not in (None, env.convention) and env.obs_type != OBJECTS:
         raise MemobenchError(f"{meta.root} has pictures of convention={stated}; set env.convention={stated}")
-    if config.policy.type == "xvla":
+    if policy.type == "xvla":
         raise MemobenchError(
             "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
             "checkpoints with `lerobot eval env=memobench`"
         )
-    env.declare_plans(config.policy)
-    policy = with_features(config.policy, features)
-    check_features(f"that learns from {meta.root}", policy, env_to_policy_features(config.env), config.rename_map)
+    env.declare_plans(policy)
+    made = with_features(policy, features)
+    check_features(f"that learns from {meta.root}", made, env_to_policy_features(env), config.rename_map)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

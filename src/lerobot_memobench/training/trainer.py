@@ -28,7 +28,6 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
 from lerobot_memobench.datasets.frames import SamplesInMemory
-from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import chooses_inputs
 from lerobot_memobench.errors import MemobenchError
@@ -37,13 +36,7 @@ from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
 from lerobot_memobench.protocol import CLOCK, IMAGE_SIZE
 from lerobot_memobench.run.command_line import register_plugins
-from lerobot_memobench.training.data import (
-    check_dataset_version,
-    check_environment,
-    check_episodes,
-    complete_statistics,
-    with_features,
-)
+from lerobot_memobench.training.data import check_environment, complete_statistics, open_metadata, with_features
 from lerobot_memobench.training.features import cameras_of
 from lerobot_memobench.training.view import (
     SOURCE_EPISODE,
@@ -72,11 +65,7 @@ def prepare(
     given, policy = config.dataset, config.policy
     if policy is None:
         return config
-    if given.root is not None:
-        given.root = str(without_pattern(Path(given.root)))
-    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
-    check_dataset_version(meta)
-    check_episodes(given.episodes, meta)
+    meta = open_metadata(given)
     options = view_options(policy, meta.features, prompt_frames, obs_type)
     features = {new: meta.features[name] for name, new in options.columns(meta.features).items()}
     if policy.pretrained_path is not None and not config.rename_map:
