@@ -102,7 +102,7 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
     root = config.dataset.root
     with (
         adding_resume_hint("lerobot", lambda: resume_hint(config, words)),
-        locked_run(config),
+        locked_run(asked.get("output_dir")),
         naming_damage(Path(root) if root else None),
     ):
         if config.policy is not None and config.policy.type == MEMORY_POLICY:
@@ -119,16 +119,15 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
 
 
 @contextmanager
-def locked_run(config: TrainPipelineConfig) -> Iterator[None]:
-    """Lock the folder of a training, in its first process; refuse it if another training holds the lock.
+def locked_run(folder: str | None) -> Iterator[None]:
+    """Lock the folder of a training if it is named, in its first process; refuse it if another training holds the lock.
 
     The lock is a file next to the folder, because LeRobot refuses a folder that exists before its first checkpoint.
     """
-    assert config.output_dir is not None
-    if os.environ.get("RANK", "0") != "0":
+    if folder is None or os.environ.get("RANK", "0") != "0":
         yield
         return
-    run = Path(config.output_dir).expanduser().absolute()
+    run = Path(folder).expanduser().absolute()
     run.parent.mkdir(parents=True, exist_ok=True)
     lock = run.with_name(f".{run.name}.lock")
     lock.touch()

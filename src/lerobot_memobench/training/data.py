@@ -38,7 +38,6 @@ from lerobot_memobench.datasets.frames import (
 from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
 from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
 from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, check_revision, list_episodes
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
@@ -70,7 +69,7 @@ from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_enc
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.sim.scene_hash import check_world
-from lerobot_memobench.training.features import cameras_of, detected_slots, picture_tokens, remembered_features
+from lerobot_memobench.training.features import detected_slots, picture_features
 from lerobot_memobench.training.sampler import seed_of
 
 logger = logging.getLogger(__name__)
@@ -242,14 +241,8 @@ def open_lookup(
         columns, table = read_recorded(root, names)
         logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     table = with_targets(table, config, root)
-    cameras = cameras_of(read_info(root)["features"])
-    if isinstance(encoder, ImageTowerEncoder):
-        if config.memory != NONE:
-            camera = in_data.get(encoder.memory_input, encoder.memory_input) or next(iter(cameras), "")
-            remember = remembered_features(root, config, encoder, camera).tokens
-    elif isinstance(encoder, VisualTokenEncoder):
-        names_in_data = {name: in_data.get(name, name) for name in encoder.cameras or [*cameras, encoder.memory_input]}
-        memory, present = picture_tokens(root, config, encoder, names_in_data)
+    if isinstance(encoder, ImageTowerEncoder | VisualTokenEncoder):
+        memory, present = picture_features(root, config, encoder, in_data)
         encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
         remember = None if memory is None else memory.tokens
     else:

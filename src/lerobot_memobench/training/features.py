@@ -30,7 +30,7 @@ from lerobot_memobench.datasets.lerobot_format.tables import read_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged
 from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
@@ -46,6 +46,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     thumbnails,
 )
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
+from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_layout import SIZE
@@ -208,43 +209,41 @@ def cameras_of(features: Mapping[str, Any]) -> list[str]:
 # -- features of each kind of policy -----------------------------------------------------------------------------------
 
 
-SMALL = Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
-"""Grey thumbnails, for a memory of motion."""
-
-
-def remembered_features(
-    root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, camera: str, **how: Any
-) -> EpisodeFeatures:
-    """Make the memory's features for a policy with an image tower: pooled tokens, or thumbnails."""
-    features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
-    return _memory_features(root, config, features, camera=camera, **how)
-
-
-def _memory_features(root: Path, config: MemobenchMemConfig, pooled: Features, **how: Any) -> EpisodeFeatures:
-    stride = config.memory_stride
-    kind, features = ("thumbnails", SMALL) if config.remembers_thumbnails else (config.size, pooled)
-    return make_features(root, f"{kind}-stride{stride}", features, stride=stride, **how)
-
-
-def picture_tokens(
-    root: Path, config: MemobenchMemConfig, encoder: VisualTokenEncoder, cameras: dict[str, str], **how: Any
+def picture_features(
+    root: Path,
+    config: MemobenchMemConfig,
+    encoder: ImageTowerEncoder | VisualTokenEncoder,
+    in_data: Mapping[str, str],
+    **how: Any,
 ) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
-    """Make a visual encoder's tokens of present pictures, and the memory's features.
+    """Make the features of the memory, None without one, and a visual encoder's tokens of present pictures.
 
     Pooled tokens are computed from the present ones, so that no video is decoded twice.
 
     Args:
-        cameras: the policy's name of each camera -> the dataset's. The present features have the policy's names.
+        in_data: the policy's name of a camera -> the dataset's, where they differ. The present ones have the policy's.
+        how: of `make_features`.
     """
-    whole = Features(encoder.present_key, GRID**2 * WIDTH, encoder.encode)
-    prefix = f"{config.size}-present"
-    present = {name: make_features(root, prefix, whole, camera=of, **how) for name, of in cameras.items()}
-    if config.memory == "none":
+    cameras, remembered, stride = cameras_of(read_info(root)["features"]), encoder.memory_input, config.memory_stride
+    present: dict[str, EpisodeFeatures] = {}
+    if isinstance(encoder, VisualTokenEncoder):
+        whole = Features(encoder.present_key, GRID**2 * WIDTH, encoder.encode)
+        for name in dict.fromkeys(encoder.cameras or [*cameras, remembered]):
+            camera = in_data.get(name, name)
+            present[name] = make_features(root, f"{config.size}-present", whole, camera=camera, **how)
+    if config.memory == NONE:
         return None, present
-    remembered = encoder.memory_input
-    pooled = Features(encoder.key, encoder.tokens_per_frame * WIDTH, encoder.pooled)
-    read = None if config.remembers_thumbnails else present[remembered].tokens
-    return _memory_features(root, config, pooled, camera=cameras[remembered], read=read, **how), present
+    kind: str = config.size
+    read: FrameReader | None = None
+    if config.remembers_thumbnails:
+        kind, features = "thumbnails", Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
+    elif isinstance(encoder, VisualTokenEncoder):
+        features, read = Features(encoder.key, POOLED**2 * WIDTH, encoder.pooled), present[remembered].tokens
+    else:
+        features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
+    camera = in_data.get(remembered, remembered) or next(iter(cameras), "")
+    name = f"{kind}-stride{stride}"
+    return make_features(root, name, features, camera=camera, stride=stride, read=read, **how), present
 
 
 def detected_slots(
@@ -325,8 +324,7 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     Raises:
         MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.
     """
-    cameras = cameras_of(read_info(root)["features"])
-    config.memory_camera = config.memory_camera or next(iter(cameras), None)
+    config.memory_camera = config.memory_camera or next(iter(cameras_of(read_info(root)["features"])), None)
     if config.detector is not None:
         detect = ObjectsFromPictures(load_detector(config.detector))
         return detected_slots(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
@@ -335,9 +333,6 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
             "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
             "this command, or name a detector"
         )
-    camera = config.memory_camera or ""
-    if config.uses_visual_encoder:
-        encoder = load_token_encoder(config, weights)
-        memory, present = picture_tokens(root, config, encoder, {name: name for name in cameras or [camera]}, **how)
-        return (memory or next(iter(present.values()))).folder
-    return remembered_features(root, config, load_image_tower(config, weights), camera, **how).folder
+    load = load_token_encoder if config.uses_visual_encoder else load_image_tower
+    memory, present = picture_features(root, config, load(config, weights), {}, **how)
+    return (memory or next(iter(present.values()))).folder
