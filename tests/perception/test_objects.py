@@ -12,8 +12,17 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.experts.demonstration_prompt import highlight_of
 from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
-from lerobot_memobench.perception.geometry import projected, view_of, views_of
-from lerobot_memobench.perception.objects import APART, FACING, MIN_SCORE_ALONE, ONE, PARTS, SAME, ObjectLocalizer
+from lerobot_memobench.perception.objects import (
+    APART,
+    FACING,
+    MIN_SCORE_ALONE,
+    ONE,
+    PARTS,
+    SAME,
+    ObjectLocalizer,
+    projected,
+    views_of,
+)
 from lerobot_memobench.perception.weights import (
     PACKAGE,
     load_detector,
@@ -70,7 +79,7 @@ def objects_of(slots: NDArray[np.float32] | torch.Tensor) -> NDArray[np.float32]
 @pytest.mark.parametrize("camera", MJCF_CAMERAS)
 def test_views_are_the_cameras(camera: str) -> None:
     for sim in (simulation(BOWLS), bent(simulation(DRAWERS))):
-        view, own = view_of(camera, sim.proprio()), sim.model.camera(MJCF_CAMERAS[camera]).id
+        view, own = views_of(sim.proprio())[camera], sim.model.camera(MJCF_CAMERAS[camera]).id
         assert np.allclose(view["eye"], sim.data.cam_xpos[own], atol=1e-5)
         assert np.allclose(view["turned"], sim.data.cam_xmat[own].reshape(3, 3), atol=1e-5)
         assert view["slope"] == pytest.approx(np.tan(np.radians(sim.model.cam_fovy[own]) / 2))
@@ -163,7 +172,7 @@ def count(
     for camera, kind, score, place in things:
         find = detected[camera][filled[camera] : filled[camera] + 1]
         filled[camera] += 1
-        at, depth = projected(np.array([place]), view_of(camera, state))
+        at, depth = projected(np.array([place]), views_of(state)[camera])
         find["kind"], find["score"], find["turn"] = kinds().index(kind), score, (1.0, 0.0)
         find["place"], find["depth"], find["height"] = at, depth, place[2] - TABLE_TOP
     return len(objects_of(localizer.slots(detected, views_of(state))))

@@ -15,7 +15,7 @@ from lerobot_memobench.policies.memobench_mem.alignment import make_alignment, r
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled_subgoals
 from lerobot_memobench.policies.memobench_mem.text_encoders import WordTextEncoder
-from lerobot_memobench.training.texts import with_targets
+from lerobot_memobench.training.data import with_targets
 from tests.support.small_policy import batch_of, made_for_training
 
 B, F, P, D, T = 5, 3, 4, 6, 7

@@ -25,7 +25,7 @@ from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
 from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training import loop
-from lerobot_memobench.training.configuration import complete
+from lerobot_memobench.training.command import complete_training
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 TASK = "fold the towel"
@@ -74,7 +74,7 @@ def train(root: Path, out: Path, *flags: str, size: str = "tiny") -> Path:
         "--policy.push_to_hub=false",
     ]
     asked = read_words("train", parse_words([*own, *usual, *flags]))
-    loop.train(complete(asked.build(), asked))
+    loop.train(complete_training(asked))
     return out / "checkpoints" / "last" / "pretrained_model"
 
 

@@ -212,14 +212,14 @@ def view(
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.episodes import read_info
-    from lerobot_memobench.training.view import choice_for, write_view
+    from lerobot_memobench.training.view import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
     if convention is not None:
         check_choice("convention", convention, [*CONVENTIONS])
-    choice = choice_for(None, read_info(dataset)["features"], prompts, obs_type)
-    write_view(dataset, out, replace(choice, convention=convention))
+    options = view_options(None, read_info(dataset)["features"], prompts, obs_type)
+    write_view(dataset, out, replace(options, convention=convention))
     say(f"view: {out}")
 
 

@@ -84,9 +84,9 @@ def run(line: Sequence[str]) -> int:
         raise MemobenchError("found python -OO or PYTHONOPTIMIZE=2, and transformers reads docstrings; use -O or 1")
     check_names(name, words)
     if name == "train":
-        from lerobot_memobench.training.command import train
+        from lerobot_memobench.training.command import run_training
 
-        return train(words, note)
+        return run_training(words, note)
     use_threads(ACTING)  # before torch is imported
     if is_of_benchmark(words) and HELP not in words:
         return evaluate(words)

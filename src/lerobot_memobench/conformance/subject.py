@@ -208,7 +208,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_memobench.training.data import open_datasets, open_training
-    from lerobot_memobench.training.view import choice_for, needs_view, write_view
+    from lerobot_memobench.training.view import needs_view, view_options, write_view
 
     raw = LeRobotDataset(repository, root=root)
     if not set(CLOCK) <= set(raw.meta.features):
@@ -224,11 +224,11 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
         policy.open_loop = True
     else:
-        choice = choice_for(config, raw.meta.features, None, obs_type)
-        if not choice.prompts:
+        options = view_options(config, raw.meta.features, None, obs_type)
+        if not options.prompts:
             numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1
-        if needs_view(raw.meta.features, choice):
-            write_view(Path(raw.root), view, choice)
+        if needs_view(raw.meta.features, options):
+            write_view(Path(raw.root), view, options)
             whole.dataset.root = str(view)
         dataset = make_dataset(whole)
         policy = make_policy(config, ds_meta=dataset.meta)

@@ -1,4 +1,4 @@
-"""Samples of LeRobot's trainer in main memory: for policies without pictures, equal to LeRobot's."""
+"""LeRobot's own trainer: its view of a dataset, its process, and samples in main memory, equal to LeRobot's."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-from lerobot_memobench.training import command, samples
-from lerobot_memobench.training.samples import keep_in_memory, open_datasets
+from lerobot_memobench.envs.settings import OBJECTS
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.run.command_line import parse_words, read_words
+from lerobot_memobench.training import trainer
+from lerobot_memobench.training.trainer import keep_in_memory, open_trainer_datasets, prepare
+from tests.support.held_dataset import make_held_dataset
 
-STATE, SLOTS = "observation.state", "observation.environment_state"
+STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
 FEATURES = {STATE: PolicyFeature(FeatureType.STATE, (8,)), SLOTS: PolicyFeature(FeatureType.ENV, (208,))}
 DELTAS = {STATE: [-0.2, -0.05, 0.0], SLOTS: [-0.2, -0.05, 0.0], "action": [0.0, 0.05, 0.1]}
 
@@ -47,7 +51,7 @@ def test_samples_equal_lerobots(objects: Path, episodes: list[int] | None) -> No
 def opened(root: Path, features: dict[str, PolicyFeature] | None = None) -> tuple[TrainPipelineConfig, Any]:
     policy = make_policy_config("act", device="cpu", push_to_hub=False, input_features=features)
     config = TrainPipelineConfig(DatasetConfig("local/data", root=str(root)), policy=policy, num_workers=4)
-    return config, open_datasets(config)[0]
+    return config, open_trainer_datasets(config)[0]
 
 
 def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Path) -> None:
@@ -64,21 +68,22 @@ def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Pa
 
 def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
     def run(words: list[str], input: bytes, **_: Any) -> SimpleNamespace:
-        assert words[1:] == ["-m", samples.__name__, "--config_path=run"]
+        assert words[1:] == ["-m", trainer.__name__, "--config_path=run/pretrained_model"]
         monkeypatch.setattr("sys.stdin", io.StringIO(input.decode()))
-        samples.main()
+        trainer.main()
         return SimpleNamespace(returncode=0)
 
     received: list[TrainPipelineConfig] = []
     policy = make_policy_config("act", device="cpu", push_to_hub=False)
     config = TrainPipelineConfig(DatasetConfig("local/data"), policy=policy, steps=1, resume=True)
+    config.checkpoint_path = Path("run")
     monkeypatch.setattr(subprocess, "run", run)
-    monkeypatch.setattr(samples, "register_plugins", lambda: None)
+    monkeypatch.setattr(trainer, "register_plugins", lambda: None)
     monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
     monkeypatch.setattr(lerobot_train, "train", received.append)
-    assert command.run_lerobot(config, "run") == 0
+    assert trainer.run_lerobot(config) == 0
     assert (received[0].steps, received[0].policy) == (1, policy)
-    assert lerobot_train.make_train_eval_datasets is open_datasets
+    assert lerobot_train.make_train_eval_datasets is open_trainer_datasets
 
 
 @pytest.mark.parametrize(("policy", "plan"), [("vqbet", (5, 5)), ("gaussian_actor", (1, 1))])
@@ -87,8 +92,56 @@ def test_environments_of_a_training_get_the_plans_of_its_policy(
 ) -> None:
     """LeRobot's trainer opens them without the policy, and holds of strict tasks depend on its plans."""
     dataset = SimpleNamespace(meta=SimpleNamespace(camera_keys=["observation.images.image"]))
-    monkeypatch.setattr(samples, "make_train_eval_datasets", lambda config: (dataset, None))
+    monkeypatch.setattr(trainer, "make_train_eval_datasets", lambda config: (dataset, None))
     environment = MemobenchEnvConfig(suite="strict")
     config = make_policy_config(policy, device="cpu", push_to_hub=False)
-    open_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))
+    open_trainer_datasets(TrainPipelineConfig(DatasetConfig("local/data"), env=environment, policy=config))
     assert (environment.replan_steps, environment.window_steps) == plan
+
+
+# -- the view of a training --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def config_of(root: Path, *words: str) -> TrainPipelineConfig:
+    config: TrainPipelineConfig = read_words("train", parse_words([*words, "device=cpu", f"dataset={root}"])).build()
+    return config
+
+
+def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path) -> None:
+    config = config_of(make_held_dataset(tmp_path / "held"), "policy=act", "episodes=[1]")
+    assert prepare(config, None, None, print).dataset.episodes == [2, 3]
+
+
+def test_trainings_share_a_view(pictured: Path) -> None:
+    given, notes = config_of(pictured, "policy=act"), list[str]()
+    for _ in range(2):
+        folder = Path(str(prepare(given, None, OBJECTS, notes.append).dataset.root))
+    assert {*LeRobotDataset("local/data", root=folder).meta.features} & {STATE, SLOTS, PICTURE} == {STATE, SLOTS}
+    assert not [note for note in notes if "pixels" in note]
+    assert [*folder.parent.iterdir()] == [folder]
+    inputs = prepare(given, True, None, notes.append).policy.input_features
+    assert PICTURE in inputs
+    assert "observation.phase" not in inputs
+    (note,) = (note for note in notes if "pixels" in note)
+    assert "observation_height=48 observation_width=48" in note
+    given.dataset.episodes = [7]
+    with pytest.raises(MemobenchError, match=r"episodes=\[7\]"):
+        prepare(given, None, None, notes.append)
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [(["policy=vqbet"], "policy=vqbet cannot read"), (["policy=xvla", "env=memobench"], "processors of LIBERO")],
+)
+def test_inputs_that_a_policy_cannot_have_are_refused(
+    synthetic: Path, cache: Path, words: list[str], named: str
+) -> None:
+    with pytest.raises(MemobenchError, match=named):
+        prepare(config_of(synthetic, *words), None, None, print)
+    assert not [*cache.rglob("info.json")]
