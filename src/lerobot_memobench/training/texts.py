@@ -17,8 +17,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
 )
 from lerobot_memobench.policies.memobench_mem.memory import NONE
-from lerobot_memobench.policies.memobench_mem.subgoals import subgoals_of, texts_of
-from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled
+from lerobot_memobench.policies.memobench_mem.texts import answers, progress, shuffled, subgoals_of, texts_of
 
 
 def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:

@@ -30,6 +30,9 @@ from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
 
+_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
+_EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
     """Return the configuration to load a checkpoint with: ``config``, or the checkpoint's own.
@@ -108,7 +111,10 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
     """Load pi0.5's weights; the memory's parameters keep their initial values."""
-    placed = {name.removeprefix("model."): tensor for name, tensor in weights.items()}
+    # As LeRobot's pi0.5: openpi's checkpoints have older names, and store the embedding as the language head only.
+    placed = {name.removeprefix("model.").replace("action_time_mlp", "time_mlp"): one for name, one in weights.items()}
+    if _HEAD in placed:
+        placed.setdefault(_EMBEDDING, placed[_HEAD])
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 
@@ -194,7 +200,7 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     if path is None:
         return
     steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in steps_of(path)}
-    for field, held in _held(steps, config, training):
+    for field, held in _held(steps, training):
         asked = getattr(config, field)
         if asked != held:
             raise MemobenchError(
@@ -203,9 +209,7 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
             )
 
 
-def _held(
-    steps: Mapping[str, Mapping[str, Any]], config: MemobenchMemConfig, training: bool
-) -> Iterator[tuple[str, object]]:
+def _held(steps: Mapping[str, Mapping[str, Any]], training: bool) -> Iterator[tuple[str, object]]:
     """Yield the settings that saved steps keep, with their values."""
     if not training or _ORACLE not in steps:
         yield "oracle_memory", _ORACLE in steps and bool(steps[_ORACLE].get("enabled", True))
@@ -217,5 +221,3 @@ def _held(
         yield "tokenizer_name", "words" if tokenizer is None else tokenizer.get("tokenizer_name")
     if tokenizer is not None:
         yield "tokenizer_max_length", tokenizer.get("max_length")
-    if not config.use_relative_actions:  # LeRobot can switch them on, but not off
-        yield "use_relative_actions", bool(steps.get("relative_actions_processor", {}).get("enabled", False))

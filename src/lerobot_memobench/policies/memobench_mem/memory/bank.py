@@ -41,11 +41,7 @@ WAVES, TIME_BASE = 128, 10_000.0
 
 @dataclass
 class BankSettings:
-    """Settings of `Bank`.
-
-    Attributes:
-        length: maximum number of entries per stream.
-    """
+    """Settings of `Bank`: the maximum number of entries per stream."""
 
     length: int = 16
 
@@ -73,7 +69,7 @@ class Bank(MemoryMechanism):
         self.reduce = nn.Linear(spec.dim, widths["perceptual"])
         self.asking = nn.Parameter(torch.randn(1, 1, spec.dim))
         self.summary = Lookup(spec.dim)
-        self.streams = nn.ModuleDict({name: Stream(width) for name, width in widths.items()})
+        self.streams = nn.ModuleDict({name: BankStream(width) for name, width in widths.items()})
         self.out = nn.ModuleDict({name: nn.Linear(width, spec.width) for name, width in widths.items()})
 
     def _present(self, tokens: Tensor) -> dict[str, Tensor]:
@@ -147,7 +143,7 @@ class Lookup(nn.Module):
         return self.norms[1](asking + self.mlp(asking)), weights
 
 
-class Stream(nn.Module):
+class BankStream(nn.Module):
     """Retrieval from the entries of a stream, and the gate of the result."""
 
     def __init__(self, width: int) -> None:

@@ -96,12 +96,9 @@ class FastWeights(MemoryMechanism):
         }
 
     def _learned(self, weight: Tensor, bias: Tensor, key: Tensor, value: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step.
+        """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step on keys and values (R, H, P, d).
 
         Its gradients are written out: it needs no autograd in a rollout, and training differentiates through it.
-
-        Args:
-            key, value: (R, H, P, d). rate: (R, H, P, 1).
         """
         made, (unit, root) = self._normed(key @ weight + bias)
         error = (made - (value - key)) * (1 + self.scale)

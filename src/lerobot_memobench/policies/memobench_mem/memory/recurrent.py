@@ -27,11 +27,7 @@ SLOTS_OF_WIDTH = 4
 
 @dataclass
 class RecurrenceSettings:
-    """Settings of a recurrence.
-
-    Attributes:
-        gradient_frames: number of last frames through which gradients pass.
-    """
+    """Settings of a recurrence: the number of last frames through which gradients pass."""
 
     gradient_frames: int = 16
 
@@ -44,11 +40,7 @@ class RecurrenceSettings:
 
 @dataclass
 class RecurrentSettings(RecurrenceSettings):
-    """Settings of `Recurrent`.
-
-    Attributes:
-        slots: number of slots; None: a quarter of the width of memory tokens.
-    """
+    """Settings of `Recurrent`: the number of slots; None: a quarter of the width of memory tokens."""
 
     slots: int | None = None
 

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 
@@ -80,7 +80,7 @@ class SubgoalChoice(nn.Module):
         self.texts = CheckpointTexts(texts, width)
 
 
-class NarrowReading(Reading):
+class NarrowPass(MemoryPass):
     """A pass with LeRobot's prefix, the memory and ``ask``, followed by the chosen text and a copy of the state.
 
     | attends to            | prefix, memory, ask | text | copy of the state | actions |
@@ -149,7 +149,7 @@ class NarrowReading(Reading):
         score = self.choice.score
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the share of the chosen text's attention on each memory token."""
         assert self.chosen is not None
         _, real = self.choice.texts(self.chosen)
@@ -163,7 +163,7 @@ class NarrowReading(Reading):
 
 
 class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read only this text (`NarrowReading`)."""
+    """Choose a text by prefix and memory; actions read only this text (`NarrowPass`)."""
 
     reports_reads = True
     parts = ("subgoal.",)
@@ -173,9 +173,9 @@ class NarrowChannel(MemoryFusion):
         assert model.memory is not None
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
-        return NarrowReading(self.model, memory, watched)
+        return NarrowPass(self.model, memory, watched)
 
 
 class Subgoal(Frames):
