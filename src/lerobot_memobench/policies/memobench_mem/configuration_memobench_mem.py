@@ -67,18 +67,13 @@ are refused then. LeRobot sets ``output_features`` from the environment; `polici
 
 
 class Condition(NamedTuple):
-    """A condition under which some fields are used; otherwise each of them must have its default.
-
-    Attributes:
-        name: of the feature that reads the fields, for error messages. holds: whether a configuration has it.
-    """
+    """A condition under which some fields are used, named by the feature that reads them, for error messages."""
 
     name: str
     holds: Callable[[MemobenchMemConfig], bool]
 
 
 OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
-PIXELS = Condition("perception=pixels", lambda it: not it.uses_objects)
 PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
 IMAGE_TOWER = Condition("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
@@ -104,13 +99,9 @@ def setting(
     least: float = -math.inf,
     most: float = math.inf,
 ) -> Any:
-    """Return a field of `MemobenchMemConfig`.
+    """Return a field of `MemobenchMemConfig`; without its condition ``used_if`` it has no effect.
 
-    Args:
-        default: its default, or ``dict`` for an empty one.
-        used_if: the condition without which the field has no effect; None: it is always used.
-        values: accepted values; empty for any value of the type.
-        least, most: accepted range.
+    The default may be ``dict``, for an empty one. No ``values`` stand for any value of the type.
     """
     metadata = {"used_if": used_if, "values": tuple(values), "least": least, "most": most}
     kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
@@ -118,11 +109,7 @@ def setting(
 
 
 class UnreadError(MemobenchError):
-    """A field without effect differs from its default.
-
-    Attributes:
-        defaults: field without effect -> its default.
-    """
+    """A field without effect differs from its default; ``defaults`` maps all such fields to their defaults."""
 
     def __init__(self, sentence: str, defaults: Mapping[str, Any]) -> None:
         super().__init__(sentence)
@@ -139,7 +126,7 @@ FROM_SIZE: Any = None
 @OptimizerConfig.register_subclass("memobench_adamw")
 @dataclass
 class FusedAdamWConfig(AdamWConfig):
-    """Fused AdamW. Torch's default copies all trained parameters on a GPU, and takes three times as long on a CPU.
+    """Fused AdamW. Torch's default takes three times as long on a CPU, and copies the parameters on a GPU.
 
     At full size the copy takes 10.5 GiB; with it, `config=train_paper` does not fit on four GPUs of 80 GB.
     """
@@ -345,11 +332,6 @@ class MemobenchMemConfig(PreTrainedConfig):
         }
 
     def _check_read(self, defaults: Mapping[str, Any]) -> None:
-        """Refuse a field without effect, unless it has its default.
-
-        Args:
-            defaults: those of `_defaults`.
-        """
         unset = {
             one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
         }
@@ -377,7 +359,6 @@ class MemobenchMemConfig(PreTrainedConfig):
             self.memory_fusion = None
 
     def _complete_memory(self) -> None:
-        """Complete the settings of the memory, and check them."""
         if self.memory == NONE:
             if self.memory_settings in [asdict(read_settings(one, {})) for one in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
@@ -536,11 +517,7 @@ class MemobenchMemConfig(PreTrainedConfig):
         return OBJECT_MEMORY.holds(self)
 
     def check_memory_reads(self) -> None:
-        """Check that the memory's fusion can report how much a chunk reads of each remembered entry.
-
-        Raises:
-            MemobenchError: there is no memory, or its own fusion has no attention weights.
-        """
+        """Refuse a memory whose fusion cannot report how much a chunk reads of each remembered entry."""
         fusion = None if self.memory == NONE else find_mechanism(self.memory).fusion
         if self.memory == NONE or (fusion is not None and not fusion.reports_reads):
             raise MemobenchError(
@@ -551,7 +528,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     # -- called by LeRobot -----------------------------------------------------------------------------------------
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
-        """Return the default optimizer of a training."""
+        """Return the optimizer of a training."""
         assert self.optimizer_lr is not None  # set by construction
         return FusedAdamWConfig(
             lr=self.optimizer_lr,
@@ -573,21 +550,13 @@ class MemobenchMemConfig(PreTrainedConfig):
     observation_delta_indices = reward_delta_indices = None
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Add the objects of a dataset with pictures to the inputs; LeRobot does not recognise their column.
-
-        LeRobot calls this with a dataset's ``features`` before it makes the policy.
-        """
+        """Add the objects of a dataset with pictures to the inputs; LeRobot does not recognise their column."""
         if not self.uses_pictures and PRIVILEGED in features:
             shape = tuple(features[PRIVILEGED]["shape"])
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
     def validate_features(self) -> None:
-        """Remove features that this perception does not read; with a detector, add its cameras.
-
-        Raises:
-            MemobenchError: object slots or the remembered camera are missing, or there are more numbers than the
-                initial weights have room for.
-        """
+        """Remove features that this perception does not read; with a detector, add its cameras."""
         unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
         for key in [key for key, one in self.input_features.items() if one.type is unseen or key in CLOCK]:
             del self.input_features[key]
@@ -617,7 +586,6 @@ class MemobenchMemConfig(PreTrainedConfig):
             )
 
     def _fit_numbers(self) -> None:
-        """Raise ``max_state_dim`` and ``max_action_dim`` to the features' lengths, unless weights are loaded."""
         state, action = self.robot_state_feature, self.action_feature
         for name, feature in (("max_state_dim", state), ("max_action_dim", action)):
             needed = 0 if feature is None else feature.shape[0]

@@ -127,11 +127,7 @@ class MemoryPass:
         self.attention: dict[str, list[Tensor]] = {part: [] for part in self.watches} if watched else {}
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Return the model's prefix, given pi0.5's.
-
-        Args:
-            state: index of the token of the robot's state; None: no such token.
-        """
+        """Return the model's prefix, given pi0.5's and the index of the token of the robot's state (None: no token)."""
         return prefix
 
     def actions(self, tokens: Tensor) -> Tensor:
@@ -145,8 +141,7 @@ class MemoryPass:
     def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
         """Return the input (B, T, W) of a layer's feed-forward, given pi0.5's.
 
-        Args:
-            normed: (B, T, W), the tokens at a mean square of one, before pi0.5's scale and shift.
+        ``normed`` (B, T, W) are the tokens at a mean square of one, before pi0.5's scale and shift.
         """
         return inputs
 
@@ -178,11 +173,7 @@ class MemoryFusion(ABC):
 
     @abstractmethod
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over a memory of width ``memory_dim``.
-
-        Args:
-            watched: collect attention weights for `MemoryPass.attention_shares`.
-        """
+        """Begin a pass over a memory; ``watched``: collect attention weights for `MemoryPass.attention_shares`."""
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -246,11 +237,8 @@ class MemoryModulator(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
-        A row whose memory is fully masked reads zeros.
-
-        Args:
-            memory: of width W. keys: of `keys`.
-            found: a list to which the attention on each memory token (B, L) is appended.
+        A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
+        ``found``.
         """
         weights: list[Tensor] | None = None if found is None else []
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)

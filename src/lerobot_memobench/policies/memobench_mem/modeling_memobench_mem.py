@@ -72,6 +72,7 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 
 logger = logging.getLogger(__name__)
 
+LANGUAGE = (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -121,9 +122,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         if dataset_meta is not None:
             self.precision.settle()  # before loading weights, which may be float32
         if config.base_weights and load_base:
-            source = config.base_weights
-            path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
-            load_base_weights(self.model, read_tensors(path), source)
+            load_base_weights(self.model, read_tensors(weights_file(config.base_weights)), config.base_weights)
         elif isinstance(self.perception, VisualTokenEncoder) and load_base:
             assert config.visual_encoder is not None
             self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
@@ -153,13 +152,12 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return self.model.memory is not None
 
     def _observed(self, batch: dict[str, Tensor]) -> Observation:
-        """Return the model's inputs of a batch."""
         parts, masks = self.perception.present(batch)
         if self.config.state_token:
             state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
         parts, masks = ([tensor.to(self._device) for tensor in tensors] for tensors in (parts, masks))
-        return Observation(parts, masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
+        return Observation(parts, masks, *(batch[key] for key in LANGUAGE))
 
     # -- training --------------------------------------------------------------------------------------------------
 
@@ -173,23 +171,18 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return list(self.trained_parameters().values())
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return the action loss, plus the memory's losses and the weighted alignment, of a preprocessed batch.
+        """Return the action loss, plus the memory's losses and the weighted alignment, and numbers to log.
 
         When the loss is only measured (``eval_loss``: evaluation mode without gradients), actions follow the subgoal
         that a privileged memory chooses, and the memory's own losses compare the choice with the true one.
 
+        The numbers are ``action_loss``, the memory's losses, and with an alignment ``align_loss`` (unweighted),
+        ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1`` (share of memory
+        vectors whose nearest text in the batch is their own).
+
         Args:
-            batch: the inputs of LeRobot's pi0.5, and ``memory.*`` and ``phase`` of the training's preprocessor. A
-                policy without memory also takes batches of LeRobot's own trainer.
+            batch: of the training's preprocessor. A policy without memory also takes those of LeRobot's own trainer.
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
-
-        Returns:
-            The loss, and numbers to log: ``action_loss``, the memory's losses, and with an alignment ``align_loss``
-            (unweighted), ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1``
-            (share of memory vectors whose nearest text in the batch is their own).
-
-        Raises:
-            MemobenchError: the batch has no memory.
         """
         batch = self.perception.observed(self._with_phase(batch))
         measures = not self.training and not torch.is_grad_enabled()
@@ -215,11 +208,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return (per_sample if reduction == "none" else total), logged
 
     def _with_phase(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a training batch with the phase of each sample, if the dataset has phases.
-
-        Raises:
-            MemobenchError: the policy has a memory and the batch has none.
-        """
         if self._remembers and FRAMES not in batch:
             raise MemobenchError(
                 f"the training batch has no '{FRAMES}': memory={self.config.memory} learns from earlier frames of the "
@@ -237,11 +225,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return self.model.memory.replay(histories, self._query(batch))
 
     def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
-        """Return the present of some rows of a batch, as far as the memory needs it.
-
-        Args:
-            rows: None: all. writes: whether the query is for writing, which has the frame's own tokens.
-        """
+        """Return the present of some rows of a batch (None: all), as far as the memory needs it to read or write."""
         memory, device = self.model.memory, self._device
         assert memory is not None
         rows = range(len(batch[OBS_STATE])) if rows is None else rows
@@ -321,7 +305,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return torch.stack([none if env.last is None else env.last for env in envs]).to(self._device)
 
     def _check_thread(self) -> None:
-        """Check that one thread runs the whole rollout; LeRobot's ``env.max_parallel_tasks`` would mix several."""
+        # LeRobot's env.max_parallel_tasks would mix several rollouts.
         if self._thread is None:
             self._thread = threading.get_ident()
         if self._thread != threading.get_ident():
@@ -349,7 +333,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
-        """Write the present frames of some environments to their memories."""
         memory, skips = self.model.memory, self.config.skips_repeated_frames
         assert memory is not None
         frames = self.perception.remember(batch, rows).to(self._device)
@@ -376,8 +359,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         Args:
             training: whether the batch is a training batch, which has its own histories; labels are not read.
         """
-        inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
-        seen, memory = self._observed({key: batch[key][rows] for key in inputs if key in batch}), None
+        read = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
+        part = {key: value[rows] for key, value in batch.items() if key in read or key.startswith(ENCODED)}
+        seen, memory = self._observed(part), None
         with self.precision.computing(self._device):
             if training:
                 memory = self.read_memory(_without_labels(batch))
@@ -403,16 +387,8 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         """Return the memory reads of the chunks of each environment's episode."""
         return [env.reads for env in self.rollout.envs]
 
-    @property
-    def _inputs(self) -> list[str]:
-        """Keys of the present observation that the model reads, if present."""
-        images = [*self.config.image_features] if self.config.uses_pictures else []
-        objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.uses_objects else []
-        return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
-
     def _require_history(self, rows: list[int]) -> None:
-        missed = self.rollout.missed(rows)
-        if missed is not None:
+        if (missed := self.rollout.missed(rows)) is not None:
             raise MemobenchError(
                 f"this policy remembers every {self.rollout.stride} control steps and did not observe step {missed} of "
                 "this episode, so its memory would differ from training; pass the observation of every control step to "
@@ -480,13 +456,10 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
         Args:
             dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-
-        Raises:
-            MemobenchError: weights do not fit, or, for evaluation, statistics are missing.
         """
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
-        path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
+        path = weights_file(source, revision)
         if dataset_meta is None:
             check_statistics(source, revision)
         # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.

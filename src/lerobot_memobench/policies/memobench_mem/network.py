@@ -125,11 +125,7 @@ class MemoryPI05(nn.Module):
         self.fusion = (self.memory.fusion or FUSIONS[str(config.memory_fusion)])(self, vlm_width, width)
 
     def memory_pass(self, memory: MemoryTokens | None, watched: bool = False) -> MemoryPass:
-        """Begin a pass over memory tokens; None: plain pi0.5.
-
-        Args:
-            watched: collect attention weights for `MemoryPass.attention_shares`.
-        """
+        """Begin a pass over memory tokens; None: plain pi0.5. ``watched`` is as of `MemoryFusion.begin`."""
         return MemoryPass() if self.fusion is None or memory is None else self.fusion.begin(memory, watched)
 
     # -- passes ------------------------------------------------------------------------------------------------------
@@ -189,13 +185,7 @@ class MemoryPI05(nn.Module):
         return [norm.dense(condition).unsqueeze(-2) for norm in adaptive_norms(self.paligemma_with_expert)]
 
     def velocity(self, x: Tensor, modulations: list[Tensor], past: PrefixKeys, memory: MemoryPass) -> Tensor:
-        """Return the velocity (B, T, A) of noisy actions (B, T, A), float32.
-
-        The expert's tokens attend to the prefix and each other.
-
-        Args:
-            modulations: scale, shift and gate (B, 1, 3 W) of each of the `adaptive_norms`.
-        """
+        """Return the velocity (B, T, A) of noisy actions (B, T, A), float32, given the `modulations` of the norms."""
         model = self.paligemma_with_expert.gemma_expert.model
         states = _narrowed(memory.actions(self.action_in_proj(x)), model)
         places = past.length + torch.arange(states.shape[1], device=states.device)
@@ -210,7 +200,6 @@ class MemoryPI05(nn.Module):
         return velocity
 
     def _call_layer(self, layer: Callable[..., Any], *given: Any) -> Any:
-        """Run a layer; with gradient checkpointing, discard its activations."""
         if self.gradient_checkpointing_enabled and self.training:
             return checkpoint(layer, *given, use_reentrant=False, preserve_rng_state=False)
         return layer(*given)
@@ -323,7 +312,6 @@ def adaptive_norms(backbone: Any) -> Iterator[Any]:
 
 
 def _narrowed(x: Tensor, model: Any) -> Tensor:
-    """Convert tokens to bfloat16 if the weights of the layers are bfloat16."""
     return x.to(torch.bfloat16) if model.layers[0].self_attn.q_proj.weight.dtype == torch.bfloat16 else x
 
 
@@ -416,7 +404,6 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
 
 
 def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
-    """Build the encoder of observations; another encoder than pi0.5's image tower replaces the tower."""
     width, camera, thumbnails = config.dimensions.vlm.width, config.memory_camera or "", config.remembers_thumbnails
     if config.uses_visual_encoder:
         tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)

@@ -87,11 +87,7 @@ class SlotEncoder(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(FEATURES + CLASS_DIM, hidden), nn.GELU(), nn.Linear(hidden, width))
 
     def forward(self, slots: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
-        """Encode slots (N, SLOTS, WIDTH) given hands (N, 6).
-
-        Returns:
-            Vectors of the M things, (M, width), and which slots hold them, (N, SLOTS) bool.
-        """
+        """Return vectors (M, width) of things in slots (N, SLOTS, WIDTH) given hands (N, 6), and their slots (bool)."""
         there = field(slots, "present").squeeze(-1) > 0
         things, hands = slots[there], hand.unsqueeze(1).expand(-1, slots.shape[1], -1)[there]
         with torch.autocast(slots.device.type, enabled=False):  # bfloat16 rounds places to 4 mm
@@ -158,8 +154,7 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
     """A token per present object; a remembered frame is stored as numbers for `ObjectPool`.
 
     Args:
-        trained: names of the classes of training, in order of their indices.
-        width: of all tokens.
+        trained: names of the classes of training, in order of their indices. width: of all tokens.
         noise: size of the detection noise added to slots in training; 0: none.
         phase: whether a remembered frame records its phase.
     """
@@ -241,11 +236,7 @@ class ObjectsFromPictures:
         return f"{fingerprint({'detector': self._detector})}-{SIDE}x{SIDE}-objects-{SIZE}"
 
     def __call__(self, pictures: Mapping[str, Tensor], states: Tensor) -> Tensor:
-        """Return the slots (N, SIZE) float32 of pictures (N, 3, H, H) in [0, 1] and robots' states (N, >= 6).
-
-        Raises:
-            MemobenchError: a camera is missing.
-        """
+        """Return the slots (N, SIZE) float32 of pictures (N, 3, H, H) in [0, 1] and robots' states (N, >= 6)."""
         for name in VIEWS:
             if name not in pictures:
                 raise MemobenchError(
@@ -261,11 +252,7 @@ class DetectionEncoder(ObjectEncoder):
     """A token per object detected in the present pictures, instead of privileged object state.
 
     The trained layers are those of `ObjectEncoder`, so a policy trained on privileged object state also acts from
-    pictures. The detector is not a part of the policy: a checkpoint holds its name, and another one may be given.
-
-    Args:
-        detect: no module, so that it is not saved in a checkpoint.
-        trained, width, phase: as of `ObjectEncoder`.
+    pictures. The detector (``detect``) is no module, so that a checkpoint holds only its name.
     """
 
     memory_input = next(iter(VIEWS))
@@ -276,11 +263,11 @@ class DetectionEncoder(ObjectEncoder):
         self.key = detect.key
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return slots as `ObjectEncoder.present` does, from detections in the batch or in its pictures."""
+        """Return the slots of detections in the batch or in its pictures."""
         return super().present(self._with_objects(batch))
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the stored frames (n, 1, D') of some rows; a batch without phases is execution."""
+        """Return the stored frames (n, 1, D') of some rows."""
         wanted = {DETECTED} if DETECTED in batch else {*VIEWS}
         chosen = {key: value[list(rows)] for key, value in batch.items() if key in wanted | {OBS_RAW_STATE, OBS_PHASE}}
         return super().remember(self._with_objects(chosen), range(len(rows)))
@@ -318,8 +305,7 @@ def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
     """Return slots (N, SLOTS, WIDTH) with the errors of a detector.
 
     Args:
-        hand: (N, >= 3), its place in the world, m, and its rotation.
-        size: factor of the errors; 1: those of the package's detector.
+        hand: (N, >= 3), its place in the world, m. size: factor of the errors; 1: those of the package's detector.
     """
     noisy = upright(slots)
     there = field(noisy, "present").squeeze(-1) > 0

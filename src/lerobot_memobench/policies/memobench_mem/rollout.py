@@ -104,9 +104,8 @@ class Rollout:
     def observe(self, clocks: Sequence[tuple[int, int]], write: Callable[[list[int]], None]) -> list[bool]:
         """Process one observation per environment; return in which of them a new episode began.
 
-        Args:
-            clocks: phase (0 prompt, 1 execution) of each environment, and the control step since the phase began.
-            write: writes the frames of given environments; called at most once.
+        ``clocks`` holds the phase (0 prompt, 1 execution) of each, and the control step since the phase began.
+        ``write`` writes the frames of given environments; it is called at most once.
         """
         if len(self.envs) != len(clocks):
             self.envs = [EnvMemory() for _ in clocks]
@@ -125,7 +124,6 @@ class Rollout:
         return started
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
-        """Set an environment's clock; return whether a new episode began."""
         env, step = self.envs[number], clock[1]
         last = env.clock
         if begins_episode(last, clock):
@@ -138,11 +136,7 @@ class Rollout:
         return False
 
     def corrupt(self, numbers: Sequence[int], changed: Callable[[int], Any]) -> None:
-        """Replace the memories of environments.
-
-        Args:
-            changed: returns the new memory of an environment; None: it begins with its next frame, as an episode does.
-        """
+        """Replace the memories of environments by ``changed``; None: a memory begins with its next frame."""
         for number in numbers:
             self.envs[number].intact = self.envs[number].memory
         for number in numbers:

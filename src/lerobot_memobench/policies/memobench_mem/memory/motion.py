@@ -1,10 +1,7 @@
 """Motion (HiF-VLA): an action chunk reads the motion of the last frames, and the expert predicts the next motion.
 
 From HiF-VLA (OpenHelix-Team/HiF-VLA, CVPR 2026): hindsight of the last 8 motions, its encoder, 8 foresight queries,
-their loss of 0.01 L1, and modulation of the expert by hindsight. Differences: motion is found by block matching of
-thumbnails, or is the displacement of objects, instead of vectors of a codec; the queries join the actions in pi0.5's
-expert, and there is no joint expert with its own norms, projections and feed-forwards for motion; two layers decode
-motion, without attention over place and time; an action chunk is learned as in pi0.5.
+their loss of 0.01 L1, and modulation of the expert by hindsight. `docs/guides/memory/motion.md` lists the differences.
 
 A motion field has C cells of K numbers. Of pictures a cell is a block of the thumbnail, whose motion is found by
 exhaustive block matching, as in a video codec; of objects it is a slot, or the hand, whose motion is a displacement.
