@@ -112,7 +112,6 @@ def test_recipe_has_the_papers_values(memory: str) -> None:
         ({"ema_decay": float("nan")}, "ema_decay=nan"),
         ({"task_weights": {"prompted": -1.0}}, "task_weights"),
         (OBJECTS | {"detection_noise": -1.0}, "detection_noise=-1.0"),
-        ({"image_resolution": (100, 100)}, "image_resolution.*48"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
@@ -126,9 +125,8 @@ def used_if(feature: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("name", "fields"),
-    [(name, OBJECTS) for name in ("visual_encoder", "image_resolution")]
+    [("visual_encoder", OBJECTS)]
     + [(name, {"size": "tiny"}) for name in ("max_state_dim", *used_if("perception=objects"))]
-    + [("image_resolution", {"size": "small"})]
     + [(name, {"memory": "none"}) for name in (*used_if("a memory"), "memory_phase")]
     + [(name, OBJECTS) for name in used_if("objective=flow_matching")]
     + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals")],
@@ -177,7 +175,6 @@ OTHERS: dict[str, Any] = {
     "task_weights": {"prompted": 9.0},
     "detector": "no such file",
     "visual_encoder": "no such encoder",
-    "image_resolution": (144, 144),
     "object_classes": ["knob"],
     "memory_fusion": "context",
     "memory_settings": {"no_such": 1},

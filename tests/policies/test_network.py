@@ -27,7 +27,7 @@ def _config(**fields: object) -> MemobenchMemConfig:
 
 def _inputs(config: MemobenchMemConfig) -> dict[str, object]:
     torch.manual_seed(1)
-    side = config.image_resolution[0]
+    side = config.image_size[0]
     words = 12
     masks = torch.ones(BATCH, words, dtype=torch.bool)
     masks[-1, 7:] = False

@@ -50,7 +50,7 @@ def inputs_of(model: MemoryPI05, seed: int = 1) -> Observation:
     real = torch.ones(B, 7, dtype=torch.bool)
     real[1, 4:] = False
     if model.state_token is None:
-        side = model.config.image_resolution[0]
+        side = model.config.image_size[0]
         seen = [torch.rand(B, 3, side, side, generator=chance) * 2 - 1]
         shown = [torch.ones(B, dtype=torch.bool)]
     else:

@@ -75,7 +75,6 @@ class Condition(NamedTuple):
 
 OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
 PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
-IMAGE_TOWER = Condition("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
 STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
 MEMORY = Condition("a memory", lambda it: it.memory != NONE)
@@ -190,8 +189,6 @@ class MemobenchMemConfig(PreTrainedConfig):
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
     n_obs_steps: int = setting(1, least=1, most=1)
-    image_resolution: tuple[int, int] | None = setting(None, used_if=IMAGE_TOWER)
-    """Height and width to which pictures are resized, pixels; None: those of the size."""
     max_state_dim: int = setting(32, used_if=STATE_TOKEN)
     """Numbers of a state, padded; raised to the dataset's, unless weights are loaded."""
 
@@ -309,13 +306,12 @@ class MemobenchMemConfig(PreTrainedConfig):
             self.num_inference_steps = 1
         self._check_numbers()
         super().__post_init__()
-        self._check_image_resolution()
         self._check_alignment()
 
     def _defaults(self) -> dict[str, Any]:
         """Return the defaults that depend on the size, the perception and the memory."""
         dims = self.dimensions
-        side, mode = SIDE if self.uses_visual_encoder else dims.vision.image, NormalizationMode(dims.normalization)
+        mode = NormalizationMode(dims.normalization)
         planned = self.chunk_size or dims.defaults["chunk_size"]
         room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
         return {
@@ -328,7 +324,6 @@ class MemobenchMemConfig(PreTrainedConfig):
             "tokenizer_max_length": dims.tokenizer_max_length + room,
             "text_encoder": dims.text_encoder,
             "normalization_mapping": {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode},
-            "image_resolution": (side, side),
         }
 
     def _check_read(self, defaults: Mapping[str, Any]) -> None:
@@ -345,9 +340,7 @@ class MemobenchMemConfig(PreTrainedConfig):
         unread: dict[str, Condition] = {}
         for name, condition in conditions(self).items():
             known = [unset[name], defaults.get(name), *usual.get(name, ())]
-            value = getattr(self, name)
-            value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
-            if value not in known and not condition.holds(self):
+            if getattr(self, name) not in known and not condition.holds(self):
                 unread[name] = condition
         for name, condition in unread.items():
             raise UnreadError(
@@ -407,14 +400,6 @@ class MemobenchMemConfig(PreTrainedConfig):
             )
         if any(weight < 0 for weight in (self.task_weights or {}).values()):
             raise MemobenchError(f"--policy.task_weights={self.task_weights} must not hold negative weights.")
-
-    def _check_image_resolution(self) -> None:
-        multiple = MEMORY_GRID * self.dimensions.vision.patch
-        if not self.uses_visual_encoder and any(side % multiple for side in self.image_size):
-            raise MemobenchError(
-                f"--policy.image_resolution={self.image_resolution} must be a multiple of {multiple} pixels at "
-                f"size {self.size}, so that its patches pool to a {MEMORY_GRID}x{MEMORY_GRID} grid."
-            )
 
     def _check_alignment(self) -> None:
         if self.align == NONE:
@@ -489,9 +474,9 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width of the policy's images, pixels."""
-        assert self.image_resolution is not None
-        return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
+        """Height and width to which pictures are resized, pixels."""
+        side = SIDE if self.uses_visual_encoder else self.dimensions.vision.image
+        return side, side
 
     @property
     def tokens_per_frame(self) -> int:

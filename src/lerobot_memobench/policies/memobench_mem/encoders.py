@@ -132,7 +132,7 @@ def pool_tokens(tokens: Tensor) -> Tensor:
 
 
 class ImageTowerEncoder(ObservationEncoder):
-    """The image tower, and the projection of its tokens to the language model's width.
+    """pi0.5's frozen image tower, and the projection of its tokens to the language model's width.
 
     Args:
         resolution: height and width of the tower's pictures, pixels. camera: the remembered one.
@@ -167,11 +167,7 @@ class ImageTowerEncoder(ObservationEncoder):
         return thumbnails(pictures) if self.thumbnails else self(pictures)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return the tower's pictures of all cameras; black ones, masked, for cameras that the batch lacks.
-
-        Raises:
-            MemobenchError: the batch has no picture.
-        """
+        """Return the tower's pictures of all cameras; black ones, masked, for cameras that the batch lacks."""
         pictures = [self._resized(batch[camera]) for camera in self.cameras if camera in batch]
         if not pictures:
             raise MemobenchError(f"The observation has no picture; {cure('picture', batch)}")
@@ -284,11 +280,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures.
-
-        Raises:
-            MemobenchError: the batch has neither for a camera.
-        """
+        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures."""
         parts = [self._tokens(batch, camera) for camera in self.cameras]
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
 

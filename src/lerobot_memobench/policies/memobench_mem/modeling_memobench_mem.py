@@ -1,7 +1,6 @@
-"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without alignment to subgoal texts.
+"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts.
 
-This file is the policy: its construction, updates (``forward``) and actions (``select_action``). The network is in
-`network`, the environments of a rollout in `rollout`, checkpoints in `checkpoints`.
+This file is the policy: its construction, updates (``forward``) and actions (``select_action``).
 """
 
 from __future__ import annotations
@@ -257,12 +256,10 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         self._acting: list[EnvMemory] = []
 
     def corrupt_memory(self, how: str, rows: Sequence[int]) -> None:
-        """Change what environments remember, before they observe the next frame; planned actions are kept.
+        """Change what environments (numbers in the batch) remember, before the next frame; planned actions are kept.
 
-        Args:
-            how: ``delete``: they remember from the next frame on; ``swap``: they get the memory of the next one of the
-                batch; ``noise``: normal noise with the standard deviation of its values is added to it.
-            rows: numbers of the environments in the batch.
+        ``delete``: they remember from the next frame on; ``swap``: they get the memory of the next one of the batch;
+        ``noise``: normal noise with the standard deviation of its values is added to it.
         """
         memory, envs = self.model.memory, self.rollout.envs
         assert memory is not None  # `run.plan` refuses others
@@ -356,8 +353,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
     def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, training: bool = False) -> Tensor:
         """Return action chunks (n, chunk, A) of some rows of the batch, given their histories and sampling noise.
 
-        Args:
-            training: whether the batch is a training batch, which has its own histories; labels are not read.
+        A ``training`` batch has its own histories; its labels are not read.
         """
         read = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
         part = {key: value[rows] for key, value in batch.items() if key in read or key.startswith(ENCODED)}
@@ -420,9 +416,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         A policy with a memory must have observed every control step (`observe`), unless observations have a clock
         (``observation.step``); `select_action` observes by itself. A training batch has its own histories. ``noise``
         (B, chunk, max_action_dim) replaces the episodes' own.
-
-        Raises:
-            MemobenchError: observations were left out between two chunks.
         """
         self.eval()
         if training := PHASE in batch:

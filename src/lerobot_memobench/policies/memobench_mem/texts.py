@@ -197,11 +197,7 @@ class SiglipTextEncoder:
 
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return pooled text features (N, dim), float32.
-
-        Raises:
-            MemobenchError: the weights cannot be loaded, or have another width.
-        """
+        """Return pooled text features (N, dim), float32."""
         tokenizer, model = self._load()
         rows = []
         for part in itertools.batched(texts, 64):
@@ -211,7 +207,6 @@ class SiglipTextEncoder:
         return torch.cat(rows)
 
     def _load(self) -> tuple[Any, Any]:
-        """Return tokenizer and model."""
         from transformers import AutoTokenizer, SiglipTextModel
 
         try:
@@ -239,7 +234,6 @@ def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncod
 def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
     """Return the texts (..., d_t) of frames and their mask (...), as inputs of `losses.alignment_loss`.
 
-    Args:
-        embeddings: of all texts, (T, d_t). rows: (...) integers, row of each frame's text, -1 for none.
+    ``embeddings`` (T, d_t) are those of all texts; ``rows`` (...) is the row of each frame's text, -1 for none.
     """
     return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.long().clamp(min=0)]}

@@ -222,10 +222,9 @@ class Motion(MemoryMechanism):
 
 
 class MotionField(nn.Module, ABC):
-    """Motion between two stored frames, and tokens of it; the layers of the tokens are trained.
+    """Motion between two stored frames of D' numbers (``size``), and tokens of it, whose layers are trained.
 
-    Attributes:
-        size: D', numbers of a stored frame. cells: C. numbers: K of a cell; the first ``moved`` are motion.
+    There are C ``cells``, of K ``numbers`` each; the first ``moved`` are motion.
     """
 
     size: int
@@ -241,8 +240,7 @@ class MotionField(nn.Module, ABC):
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Follow the cells of the first of frames (B, n + 1, 1, D') from frame to frame.
 
-        Returns:
-            Their motion (B, n, C, moved), and for which cells it is known, (B, n, C) bool.
+        Return their motion (B, n, C, moved), and for which cells it is known, (B, n, C) bool.
         """
 
     @abstractmethod
@@ -339,9 +337,7 @@ class ObjectMotion(MotionField):
     """Displacement of each slot's thing and of the hand; one token per pair of frames, pooled by learned attention.
 
     A cell's numbers are its motion, whether it is known, its class, and its place. The hand has class ``kinds``.
-
-    Args:
-        order, kinds: of classes, as of `objects.SlotEncoder`.
+    ``order`` and ``kinds`` are as of `objects.SlotEncoder`.
     """
 
     size, cells, numbers, moved = SIZE + HAND_DIM + 1, SLOTS + 1, MOVED + 5, MOVED
@@ -356,8 +352,7 @@ class ObjectMotion(MotionField):
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
         """Return the displacement of the thing in each slot of the earlier frame, and of the hand."""
-        field, _ = self._between(before, now)
-        return field
+        return self._between(before, now)[0]
 
     def _between(self, before: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
         """Return the field (N, C, K), and the cell of each thing in the later frame, (N, C)."""
