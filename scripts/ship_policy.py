@@ -37,7 +37,7 @@ from lerobot_memobench.tasks.task import DRAWN
 TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
-OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
+OF_THE_DATA = ("input_features", "output_features", "object_classes")
 """Settings of a policy that its dataset decides."""
 OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
 """Words of an evaluation's command that a card does not repeat."""

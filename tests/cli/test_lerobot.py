@@ -302,10 +302,10 @@ DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
         {"policy.align": "semantic", "dataset.repo_id": "a/b", "policy.push_to_hub": False, "steps": 100_000},
     ),
     # A memory that is not the checkpoint's has its own defaults.
-    (SMALL, {"policy.memory_stride": 8, "policy.memory_repeats": False}),
-    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8, "policy.memory_repeats": False}),
+    (SMALL, {"policy.memory_stride": 8}),
+    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8}),
     ([*SMALL, "policy.memory=motion", "policy.memory_stride=2"], {"policy.memory_stride": 2}),
-    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False, "policy.memory_repeats": True}),
+    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False}),
 ]
 
 

@@ -30,7 +30,7 @@ from lerobot_memobench.perception.weights import (
     save_detector,
     warn_of_former_scenes,
 )
-from lerobot_memobench.policies.memobench_mem.detection_noise import in_order
+from lerobot_memobench.policies.memobench_mem.objects import in_order
 from lerobot_memobench.sim.asset import TABLE_TOP, split_class
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes

@@ -105,7 +105,7 @@ def test_datasets_of_other_robots(
         assert found.shape == (1, action)
         assert found.isfinite().all()
     assert config.memory_camera == next(iter(cameras))
-    stored = [frame.step for frame in policy.rollout.rows[0].memory[0]]
+    stored = [frame.step for frame in policy.rollout.envs[0].memory[0]]
     assert stored == [*range(0, 5, config.memory_stride)]
 
 

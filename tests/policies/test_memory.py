@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
+from lerobot_memobench.policies.memobench_mem.memory.motion import MotionField
 
 P, D, SUBGOALS = 2, 16, ("close it", "open it", "put it there")
 

@@ -31,19 +31,16 @@ from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem import objects
-from lerobot_memobench.policies.memobench_mem.detection_noise import (
-    FALSE,
-    KIND_MISSED,
-    MISSED,
-    with_detection_noise,
-)
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
-from lerobot_memobench.policies.memobench_mem.fusion import Reading
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, PLACES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import (
     DETECTED,
+    FALSE,
     FEATURES,
+    KIND_MISSED,
+    MISSED,
     OBS_RAW_STATE,
     VIEWS,
     ObjectEncoder,
@@ -51,6 +48,7 @@ from lerobot_memobench.policies.memobench_mem.objects import (
     SlotEncoder,
     frame_row,
     slot_features,
+    with_detection_noise,
 )
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, field
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
@@ -191,7 +189,7 @@ def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
     assert difference(frames[0], frames[7]) > 4 * case.of.rounding, "frames differ"
     prefixes = []
     for batch in (trained, acted):
-        prefix = policy.model.embed(policy._seen(batch | {key: trained[key] for key in PROMPT_KEYS}), Reading())
+        prefix = policy.model.embed(policy._observed(batch | {key: trained[key] for key in PROMPT_KEYS}), MemoryPass())
         prefixes.append(prefix.tokens[prefix.real])
     assert difference(*prefixes) <= 2 * case.of.rounding
 

@@ -329,7 +329,6 @@ OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
         "size": st.just("tiny"),
         "replan": st.integers(1, 50).map(str),
         "policy.base_weights": st.just("null"),
-        "policy.rtc_config": st.just("null"),
         "policy.optimizer_betas": st.just("[0.9, 0.99]"),
     },
     "memobench_remote": {

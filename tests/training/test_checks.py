@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.run.command_line import parse_words, read_words
-from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.training.command import READ, check_settings, complete_training
 from lerobot_memobench.training.data import open_metadata
 from lerobot_memobench.training.loop import begin
@@ -63,14 +61,6 @@ def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:
     asked.field_of_tomorrow = 3
     with pytest.raises(MemobenchError, match="field_of_tomorrow=3 has no effect"):
         check_settings(asked)
-
-
-def test_demonstrations_of_former_scenes_are_refused(tmp_path: Path) -> None:
-    for world in (LIBERO, None):  # version 0.2 wrote none
-        root = make_object_dataset(tmp_path / str(world), records=True, world=world)
-        error = pytest.raises(MemobenchError, match=r"episode 0 of .* version 0\.2")
-        with nullcontext() if world else error:
-            open_metadata(DatasetConfig("memobench/objects", root=str(root)))
 
 
 def test_accumulation_of_gradients_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
-from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
+from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
 from tests.support.small_policy import (

@@ -62,9 +62,14 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     follow_training,
     make_memobench_mem_pre_post_processors,
 )
-from lerobot_memobench.policies.memobench_mem.subgoals import subgoals_of, texts_of
-from lerobot_memobench.policies.memobench_mem.targets import answers, progress, shuffled
-from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_encoder
+from lerobot_memobench.policies.memobench_mem.texts import (
+    answers,
+    make_text_encoder,
+    progress,
+    shuffled,
+    subgoals_of,
+    texts_of,
+)
 from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.features import detected_slots, picture_features
@@ -365,7 +370,7 @@ def make_training_processors(
 ) -> tuple[Any, Any]:
     """Return pre- and postprocessor of a training: new ones, or those of the checkpoint that it begins with."""
     policy: Any = config.policy
-    stats = {**meta.stats, **execution_statistics(policy, meta, lookup)}
+    stats = {**meta.stats, **execution_statistics(lookup)}
     if not policy.pretrained_path:
         return make_memobench_mem_pre_post_processors(policy, stats, meta, lookup)
     kept: dict[str, Any] = {} if config.resume else {"stats": stats}  # a resumed training keeps its statistics
@@ -376,13 +381,6 @@ def make_training_processors(
         "rename_observations_processor": {"rename_map": config.rename_map},
     }
     after: dict[str, Any] = {"unnormalizer_processor": {**normalized, "features": policy.output_features}}
-    if policy.use_relative_actions:
-        before["relative_actions_processor"] = {
-            "enabled": True,
-            "exclude_joints": policy.relative_exclude_joints,
-            "action_names": policy.action_feature_names,
-        }
-        after["absolute_actions_processor"] = {"enabled": True}
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=policy,
         pretrained_path=policy.pretrained_path,
@@ -394,28 +392,11 @@ def make_training_processors(
     return preprocessor, postprocessor
 
 
-def execution_statistics(
-    config: MemobenchMemConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
-) -> dict[str, dict[str, Any]]:
-    """Return the statistics of states and actions over frames to learn from; {} if LeRobot makes the samples.
-
-    Statistics of relative actions depend on the chunk and are the dataset's.
-
-    Raises:
-        MemobenchError: actions are relative, and the dataset has statistics of absolute actions.
-    """
+def execution_statistics(lookup: FrameLookup) -> dict[str, dict[str, Any]]:
+    """Return the statistics of states and actions over frames to learn from; {} if LeRobot makes the samples."""
     if not lookup.columns:
         return {}
     columns = {name: lookup.columns[name].numpy() for name in (OBS_STATE, ACTION)}
     found = {name: get_feature_stats(one[lookup.acts], axis=0, keepdims=False) for name, one in columns.items()}
-    if config.use_relative_actions:
-        found[ACTION] = dict(meta.stats[ACTION])
-        if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
-            raise MemobenchError(
-                f"the dataset {meta.root} has statistics of absolute actions, and "
-                "--policy.use_relative_actions=true normalises relative ones; recompute them "
-                "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
-                f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out"
-            )
     found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STD_OFFSET
     return found

@@ -33,7 +33,6 @@ from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged
-from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -47,6 +46,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 )
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
 from lerobot_memobench.policies.memobench_mem.memory import NONE
+from lerobot_memobench.policies.memobench_mem.network import make_backbone
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_layout import SIZE

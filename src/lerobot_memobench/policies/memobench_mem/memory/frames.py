@@ -56,11 +56,6 @@ class Frame:
     noise: int | None = None
 
 
-def noisy(tokens: Tensor, seed: int | None) -> Tensor:
-    """Return the memory tokens (P, d_m) of a frame, with noise if there is a seed."""
-    return tokens if seed is None else with_noise(tokens, torch.Generator().manual_seed(seed))
-
-
 @dataclass
 class FramesSettings:
     """Settings of `Frames`.
@@ -105,12 +100,12 @@ class Frames(MemoryMechanism):
         """Return no frames."""
         return [[] for _ in range(rows)]
 
-    def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Store the frames."""
-        return self.write(state, frames, step)
+    def pooled(self, frames: Tensor) -> Tensor:
+        """Return the stored frames, which are pooled when they are read."""
+        return frames
 
     def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Store the frames without pooling."""
+        """Store the frames."""
         if not self.warned and any(len(row) == self.capacity for row in state):
             self.warned = True
             logger.warning(
@@ -131,8 +126,10 @@ class Frames(MemoryMechanism):
         places[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
         places, steps, real = places.to(device), steps.to(device), real.to(device)
         each = self._each(read, steps)
-        if any(frame.noise is not None for frame in read):
-            each = torch.stack([noisy(tokens, frame.noise) for tokens, frame in zip(each, read, strict=True)])
+        for number, frame in enumerate(read):
+            if frame.noise is not None:
+                each = each.clone()
+                each[number] = with_noise(each[number], torch.Generator().manual_seed(frame.noise))
         return self._tokens(each[places].flatten(1, 2), real, steps[places])
 
     def _each(self, read: list[Frame], steps: Tensor) -> Tensor:
@@ -141,7 +138,7 @@ class Frames(MemoryMechanism):
         made = [frame.tokens for frame in read]
         if new:
             stored = torch.stack([read[number].stored for number in new]).to(steps.device)
-            tokens = self._encoded(self._pooled(stored).unsqueeze(1), steps[new, None]).squeeze(1)
+            tokens = self._encoded(stored, steps[new])
             if not isinstance(self.pool, ObjectPool):
                 return tokens
             for number, made[number] in zip(new, tokens, strict=True):
@@ -161,20 +158,18 @@ class Frames(MemoryMechanism):
         """Encode each frame once for all samples that read it."""
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
-        each = self._encoded(self._pooled(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
+        each = self._encoded(histories.frames, histories.steps)
         found = self._tokens(each, real, histories.steps[places])
         return found._replace(places=places)
 
-    def _pooled(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, P, D) of stored frames (N, P', D'); without content, zeros or the phase."""
+    def _encoded(self, frames: Tensor, steps: Tensor) -> Tensor:
+        """Return memory tokens (N, P, d_m) of stored frames (N, P', D') at control steps (N,)."""
         if not self.settings.content and isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
-            return self.pool.phases(frames)
-        tokens: Tensor = self.pool(frames)
-        return tokens if self.settings.content else torch.zeros_like(tokens)
-
-    def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
-        """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
-        encoded: Tensor = self.encoder(tokens, steps)
+            tokens = self.pool.phases(frames)
+        else:
+            tokens = self.pool(frames)
+            tokens = tokens if self.settings.content else torch.zeros_like(tokens)
+        encoded: Tensor = self.encoder(tokens.unsqueeze(1), steps[:, None]).squeeze(1)
         return encoded
 
     def _tokens(self, each: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:

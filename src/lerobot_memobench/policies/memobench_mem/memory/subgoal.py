@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, Reading
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 
@@ -66,12 +66,7 @@ def scored(scores: Tensor, choices: Tensor) -> Tensor:
 
 
 class SubgoalChoice(nn.Module):
-    """Modules that the narrow channel adds to the model.
-
-    Attributes:
-        ask: the last token of the prefix, whose last state is scored. score: maps this state to S scores.
-        texts: tokens of the texts.
-    """
+    """Modules that the narrow channel adds: a last token of the prefix, whose last state is scored, and the texts."""
 
     def __init__(self, texts: tuple[str, ...], width: int) -> None:
         super().__init__()
@@ -80,7 +75,7 @@ class SubgoalChoice(nn.Module):
         self.texts = CheckpointTexts(texts, width)
 
 
-class NarrowReading(Reading):
+class NarrowPass(MemoryPass):
     """A pass with LeRobot's prefix, the memory and ``ask``, followed by the chosen text and a copy of the state.
 
     | attends to            | prefix, memory, ask | text | copy of the state | actions |
@@ -128,8 +123,7 @@ class NarrowReading(Reading):
     def attends(self, prefix: Prefix, unread: int, copies: int) -> Tensor:
         """Return which tokens attend to which, (B, N, N) bool: see the table.
 
-        Args:
-            unread: number of leading tokens that actions do not read. copies: 1 if the last is the state's copy.
+        Actions do not read the ``unread`` leading tokens; ``copies`` is 1 if the last token is the state's copy.
         """
         places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
         part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: before the text, 1: text, 2: copy
@@ -139,7 +133,6 @@ class NarrowReading(Reading):
 
     @torch.no_grad()
     def _chosen(self, prefix: Prefix) -> Tensor:
-        """Return the indices (B,) of the texts that a pass over this prefix chooses."""
         self.model.read_prefix(prefix, self)
         return self.outputs[SCORES].argmax(dim=1)
 
@@ -149,7 +142,7 @@ class NarrowReading(Reading):
         score = self.choice.score
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the share of the chosen text's attention on each memory token."""
         assert self.chosen is not None
         _, real = self.choice.texts(self.chosen)
@@ -163,7 +156,7 @@ class NarrowReading(Reading):
 
 
 class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read only this text (`NarrowReading`)."""
+    """Choose a text by prefix and memory; actions read only this text (`NarrowPass`)."""
 
     reports_reads = True
     parts = ("subgoal.",)
@@ -173,19 +166,17 @@ class NarrowChannel(MemoryFusion):
         assert model.memory is not None
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
-        return NarrowReading(self.model, memory, watched)
+        return NarrowPass(self.model, memory, watched)
 
 
 class Subgoal(Frames):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
     As in the source: cross-entropy of the text with weight 1 next to the actions' loss; the expert is trained on states
-    of the true text; its condition is states and embeddings of the text, and the robot's state. Differences: frames are
-    those of ``memory=frames`` (at most 32, even over the episode, not 120 at 2 Hz); the text is chosen from the task's
-    texts and not generated; its words have their own embeddings; the expert is pi0.5's, which reads states of every
-    layer instead of the last layer's.
+    of the true text; its condition is states and embeddings of the text, and the robot's state.
+    `docs/guides/memory/subgoal.md` lists the differences.
     """
 
     privileged = True
