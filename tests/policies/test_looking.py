@@ -16,8 +16,12 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchExpertConfig, MemobenchRandomConfig
-from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy, MemobenchRandomPolicy
+from lerobot_memobench.policies.baselines import (
+    MemobenchExpertConfig,
+    MemobenchExpertPolicy,
+    MemobenchRandomConfig,
+    MemobenchRandomPolicy,
+)
 from lerobot_memobench.run.rollout import CHUNKED, ActionQueue, plans_chunks
 from tests.support.policy_server import PolicyServer
 from tests.support.remote_case import counting, make

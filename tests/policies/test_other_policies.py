@@ -222,7 +222,7 @@ def test_first_plan_reads_the_first_execution_frame(
 
 
 def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
-    from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
+    from lerobot_memobench.policies.baselines import MemobenchExpertPolicy
 
     settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
     clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)

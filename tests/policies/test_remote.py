@@ -25,10 +25,8 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.remote import transports as wire
-from lerobot_memobench.policies.remote.configuration_remote import OPENPI_KEYS, RemoteConfig
-from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
-from lerobot_memobench.policies.remote.session import MOST_ACTIONS, fit
+from lerobot_memobench.policies import remote_connection as wire
+from lerobot_memobench.policies.remote import MOST_ACTIONS, RemoteConfig, RemotePolicy, fit
 from tests.support.policy_server import PolicyServer, robomme
 from tests.support.remote_case import IMPATIENT, PATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
 from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
@@ -44,7 +42,9 @@ def steps_of(questions: list[dict[str, Any]]) -> list[int]:
 
 def test_openpi_gets_liberos_pictures_under_its_names_whatever_the_environment_calls_them() -> None:
     """And parts of ``robot_state`` where ``keys`` asks for them."""
-    keys = ",".join([*(f"{theirs}={ours}" for theirs, ours in OPENPI_KEYS.items()), "joints=robot_state.joints.pos"])
+    keys = ",".join(
+        [*(f"{theirs}={ours}" for theirs, ours in RemoteConfig().sent().items()), "joints=robot_state.joints.pos"]
+    )
     mapping = {"agentview_image": "second", "robot0_eye_in_hand_image": "first"}
     task = "turn_on_the_stove_and_turn_it_off"
     for given, asked in ((None, None), (mapping, keys)):
@@ -207,7 +207,6 @@ def test_vla_eval_episode_with_a_prompt() -> None:
         ({"n_action_steps": 0}, "policy.n_action_steps"),
         ({"timeout": 0.0}, "policy.timeout"),
         ({"image_size": -1}, "policy.image_size"),
-        ({"mirror": True}, "convention=libero"),
     ],
 )
 def test_wrong_settings_are_named(settings: dict[str, Any], named: str) -> None:

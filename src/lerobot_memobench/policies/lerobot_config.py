@@ -27,7 +27,7 @@ NOT_THE_CHECKPOINT = (
 
 ELSEWHERE = (
     *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
-    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+    *("host", "port", "servers", "connect_timeout", "timeout"),
 )
 """Settings of where a policy runs or is published; its actions do not depend on them."""
 
