@@ -30,7 +30,6 @@ from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import (
     check_as_trained,
     check_checkpoint,
-    check_registered,
     check_statistics,
     check_weights,
     checkpoint_type,
@@ -41,7 +40,7 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreeme
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.run.card import training_facts
-from lerobot_memobench.run.command_line import checkpoint_of, parse_words, read_words
+from lerobot_memobench.run.command_line import checkpoint_of, chosen_class, parse_words, read_words
 from tests.support import mutations
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -401,4 +400,4 @@ def test_liberos_xvla_and_unknown_types_are_refused(tmp_path: Path) -> None:
         check_features(str(tmp_path), make_policy_config("xvla", device="cpu"), SHOWN, {})
     (tmp_path / "config.json").write_text('{"type": "of_a_plugin"}')
     with pytest.raises(MemobenchError, match="'of_a_plugin', which no installed package registers"):
-        check_registered(str(tmp_path))
+        chosen_class(PreTrainedConfig, "policy", {"path": str(tmp_path)})

@@ -367,7 +367,7 @@ class VlaEvalConnection(Connection):
     def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
         """Return the server's answer, with ``actions``; the first question of an episode has its prompt."""
         payload: dict[str, Any] = {}
-        for theirs, ours in (keys | {STEP: STEP} if STEP in frame else keys).items():
+        for theirs, ours in [*keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
             outer, point, inner = theirs.partition(".")
             if point:
                 payload.setdefault(outer, {})[inner] = _as_png(frame[ours])
