@@ -20,7 +20,7 @@ import lerobot_memobench.envs
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.policies.compatibility import chosen_convention
 from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import plan_line, with_names
 from lerobot_memobench.run.settings import read_settings

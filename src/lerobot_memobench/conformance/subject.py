@@ -23,7 +23,7 @@ from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.policies.convention import chosen_convention, trained_convention
+from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, parse_words, policy_config, read_words, setting_kind

@@ -17,8 +17,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.convention import trained_convention
+from lerobot_memobench.policies.compatibility import check_features, trained_convention
 from lerobot_memobench.run.command_line import CommandSettings
 from lerobot_memobench.sim.convention import convention_of
 

@@ -27,7 +27,7 @@ from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
-from lerobot_memobench.policies.compatibility import cure
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
 from lerobot_memobench.policies.memobench_mem.backbone import Precision
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
@@ -363,7 +363,7 @@ class MemobenchMemPolicy(PI05Policy):
         name = self.perception.memory_input
         if name not in batch:
             what = f"'{name}'" if name else "picture"
-            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {cure(name, batch)}")
+            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {hint(name, batch)}")
         count = len(batch[name])
         steps = _column(batch, OBS_STEP) or [self._step()] * count
         phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
