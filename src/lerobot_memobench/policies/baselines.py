@@ -38,17 +38,9 @@ class UntrainedConfig(PreTrainedConfig):
     device: str | None = "cpu"
     push_to_hub: bool = False
 
-    @property
-    def observation_delta_indices(self) -> None:
-        """No observations of other steps."""
-
-    @property
-    def action_delta_indices(self) -> None:
-        """No actions of other steps."""
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """No rewards of other steps."""
+    observation_delta_indices: ClassVar[None] = None
+    action_delta_indices: ClassVar[None] = None
+    reward_delta_indices: ClassVar[None] = None
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """Return a preset, which LeRobot needs before it builds the policy; ``forward`` refuses to train."""
@@ -133,18 +125,11 @@ class MemobenchExpertPolicy(UntrainedPolicy):
     name = "memobench_expert"
     offered: ClassVar[str] = "expert_action"
 
-    def __init__(self, config: MemobenchExpertConfig, **kwargs: Any) -> None:
-        super().__init__(config)
-
     def reset(self) -> None:
         """Do nothing: the state of the expert is in the environment."""
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the action (B, 7) in [-1, 1] in the observation.
-
-        Raises:
-            MemobenchError: the environment was made without ``offered``.
-        """
+        """Return the action (B, 7) in [-1, 1] in the observation; refuse one of an environment without ``offered``."""
         key = f"observation.{self.offered}"
         if key not in batch:
             raise MemobenchError(

@@ -81,9 +81,8 @@ def check_features(
     that read pictures of any size, would act on inputs unlike their training data.
 
     Args:
-        path: folder of the checkpoint, or a repository.
-        policy: its configuration.
-        shown: the environment's features by their names at the policy, and its action.
+        path: folder of the checkpoint, or a repository. policy: its configuration.
+        shown: features of the environment's observations and action, by LeRobot's names.
         renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
     """
     check_actions(path, policy)

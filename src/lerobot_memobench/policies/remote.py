@@ -148,20 +148,12 @@ class RemoteConfig(UntrainedConfig):
         return (self.connection.image_size if self.image_size is None else self.image_size) or None
 
     def addresses(self) -> list[str]:
-        """Return the addresses of the servers, ``scheme://host:port``.
-
-        Raises:
-            MemobenchError: an address is invalid.
-        """
+        """Return the addresses of the servers, ``scheme://host:port``, or refuse an invalid one."""
         given = self.servers.split(",") if self.servers else [f"{self.host}:{self.port or self.connection.port}"]
         return [_address(text.strip()) for text in given]
 
     def sent(self) -> dict[str, str]:
-        """Return the server's name -> our name of each sent observation.
-
-        Raises:
-            MemobenchError: ``keys`` is not a list of pairs.
-        """
+        """Return the server's name -> our name of each sent observation, or refuse ``keys`` that are no pairs."""
         if self.keys is None:
             return dict(self.connection.keys)
         pairs = [tuple(part.strip() for part in pair.split("=", 1)) for pair in self.keys.split(",")]
@@ -229,7 +221,7 @@ class RemotePolicy(UntrainedPolicy):
         """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked in parallel.
 
         Raises:
-            MemobenchError: a server fails or does not return, or its memory cannot serve the batch.
+            MemobenchError: a server fails, disconnects or gives a wrong answer, or its memory cannot serve the batch.
         """
         count = len(next(value for value in batch.values() if isinstance(value, Tensor) and value.ndim))
         limit = self.config.max_environments
@@ -267,11 +259,7 @@ class Client:
         self.forget()
 
     def connect(self) -> None:
-        """Connect, so that a missing server is an error before any simulation.
-
-        Raises:
-            MemobenchError: the server does not answer within ``connect_timeout``.
-        """
+        """Connect within ``connect_timeout``, so that a missing server is an error before any simulation."""
         if self._stated is None:
             found = self._connection.open(self._config.connect_timeout)
             logger.info("connected with the policy server at %s: %s", self._connection.address, short(found))
@@ -284,11 +272,7 @@ class Client:
         self._queue: deque[Action] = deque()
 
     def act(self, observation: Observation) -> Action:
-        """Return the action (7,) for the present observation, queued or of a new answer.
-
-        Raises:
-            MemobenchError: the server failed, took too long, disconnected, or gave a wrong answer.
-        """
+        """Return the action (7,) for the present observation, queued or of a new answer."""
         step, phase = observation.scalar(STEP), observation.scalar("phase")
         last, self._clock = self._clock, self._now(step, phase)
         begins = begins_episode(last, self._clock)
@@ -314,7 +298,6 @@ class Client:
         return self._queue.popleft()
 
     def _now(self, step: int | None, phase: int | None) -> tuple[int, int]:
-        """Return the phase and its control step."""
         if step is None:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
         return EXECUTION if phase is None else phase, step
@@ -355,12 +338,9 @@ class Client:
 
 
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
-    """Return the actions (H, 7) of an answer, with the environment's gripper convention.
+    """Return the actions (H, 7) of an answer, with the environment's gripper convention; refuse too few, or others.
 
     Infinite actions are returned too: the environment ends that episode, and the others continue.
-
-    Raises:
-        MemobenchError: there are no actions, too few, or values of another shape.
     """
 
     def wrong(found: str) -> MemobenchError:

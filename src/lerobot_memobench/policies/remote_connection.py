@@ -101,24 +101,13 @@ class Connection:
         """Keep a frame of the execution whose action is planned already."""
 
     def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
-        """Return the server's answer to an observation, with ``actions``.
-
-        Args:
-            keys: the server's name of each sent observation -> our name.
-
-        Raises:
-            MemobenchError: as `ask`.
-        """
+        """Return the server's answer to an observation; ``keys``: the server's name -> our name of what is sent."""
         return self.ask({theirs: frame[ours] for theirs, ours in keys.items()})
 
     # --- messages ---
 
     def open(self, patience: float) -> dict[str, Any]:
-        """Connect within ``patience`` seconds; return the server's metadata.
-
-        Raises:
-            MemobenchError: no server answers, or it has another protocol.
-        """
+        """Connect within ``patience`` seconds; return the server's metadata. Refuse another protocol."""
         deadline, warned = time.monotonic() + patience, False
         while True:
             try:
@@ -291,11 +280,7 @@ def _pack(value: Any) -> Any:
 
 
 def unpack(data: bytes) -> Any:
-    """Return the message in a frame of openpi or of vla-evaluation-harness.
-
-    Raises:
-        ValueError: the frame is not a message.
-    """
+    """Return the message in a frame of openpi or of vla-evaluation-harness; raise `ValueError` if it is none."""
     with refusing(lambda why: Malformed(f"it is not msgpack with arrays ({why})")):
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)
 
