@@ -288,22 +288,10 @@ def test_wrong_answers_are_named(dialect: str, answer: Any, named: str) -> None:
 
 
 def test_missing_servers_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(MemobenchError, match=r"ws://127.0.0.1:\d+ within 0.3 s"):
-        make(free_port(), **IMPATIENT)
-    out = tmp_path / "run"
-    assert evaluate(free_port(), out, "episodes=1", "policy.connect_timeout=0.2") == 2
-    assert "no policy server answered" in capsys.readouterr().err
+    out, port = tmp_path / "run", free_port()
+    assert evaluate(port, out, "episodes=1", "policy.connect_timeout=0.2") == 2
+    assert f"ws://127.0.0.1:{port} within 0.2 s" in capsys.readouterr().err
     assert not out.exists()
-
-
-def test_lost_servers_end_the_evaluation_with_advice() -> None:
-    server: Any = ScriptedServer()
-    with server:
-        policy = make(server.port, dialect="vla_eval", n_action_steps=1)
-        policy.select_action(batch(0))
-        server.die = lambda: True
-        with pytest.raises(MemobenchError, match=rf"127.0.0.1:{server.port}.*resume=true"):
-            policy.select_action(batch(1))
 
 
 # --- malformed answers ---
