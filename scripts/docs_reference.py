@@ -414,7 +414,7 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
 
 POLICIES = {
     "memobench_mem": ("policies/memobench_mem/configuration_memobench_mem.py", "MemobenchMemConfig"),
-    "memobench_remote": ("policies/remote/configuration_remote.py", "RemoteConfig"),
+    "memobench_remote": ("policies/remote.py", "RemoteConfig"),
 }
 
 

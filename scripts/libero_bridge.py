@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode_log import MERGED_FILE, has_log, read_log
 from lerobot_memobench.evaluation.statistics import mcnemar
-from lerobot_memobench.policies.remote.transports import Websocket
+from lerobot_memobench.policies.remote_connection import Connection
 from lerobot_memobench.protocol import EVALUATION_SEED, UPSTREAM, UPSTREAM_EVALUATIONS, UPSTREAM_HORIZON
 from lerobot_memobench.sim.classes import CLASSES
 from lerobot_memobench.tasks.catalogue import get_task
@@ -52,7 +52,7 @@ def tasks_without_scans() -> list[str]:
 # --- stock LIBERO ---
 
 
-def stock(folder: Path, tasks: list[str], episodes: int, server: Websocket, replan: int) -> None:
+def stock(folder: Path, tasks: list[str], episodes: int, server: Connection, replan: int) -> None:
     """Run the missing episodes of some tasks and append them to the log in ``folder``."""
     prepare()
     folder.mkdir(parents=True, exist_ok=True)
@@ -67,7 +67,7 @@ def stock(folder: Path, tasks: list[str], episodes: int, server: Websocket, repl
             print(name, record["seed"], "success" if record["success"] else "-", record["steps"], flush=True)
 
 
-def play(task: Task, episode: int, server: Websocket, replan: int) -> Record:
+def play(task: Task, episode: int, server: Connection, replan: int) -> Record:
     """Run one episode and return its log record (`envs.episode_log`)."""
     start, seed, env = time.monotonic(), EVALUATION_SEED + episode, make(task.name)
     progress, queue = Progress(task, UPSTREAM_EVALUATIONS), deque[NDArray[np.float32]]()
@@ -197,7 +197,7 @@ def main() -> None:
     if args.command == "compare":
         compare(args.here, args.there)
     else:
-        stock(args.folder, args.tasks, args.episodes, Websocket(args.server, TIMEOUT), args.replan)
+        stock(args.folder, args.tasks, args.episodes, Connection(args.server, TIMEOUT), args.replan)
 
 
 if __name__ == "__main__":

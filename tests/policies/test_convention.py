@@ -11,16 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
-import lerobot_memobench.envs
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.policies.compatibility import chosen_convention
 from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import plan_line, with_names
 from lerobot_memobench.run.settings import read_settings
@@ -150,22 +148,6 @@ def test_the_names_of_a_training_are_those_of_its_evaluation(tmp_path: Path, cap
     assert with_names(mine, MemobenchEnvConfig(convention="libero")) == mine
     assert outcome(path, None) == "libero"
     assert f"pictures have convention=libero, as in the training of {path}" in caplog.text
-
-
-def test_gymnasium(tmp_path: Path) -> None:
-    """A loop of one's own asks for the convention of its checkpoint; LeRobot's `make_policy` compares the names."""
-    for cameras, convention in ((THEIRS, "libero"), (OURS, "upright")):
-        path = saved(tmp_path / convention, cameras)
-        policy = PreTrainedConfig.from_pretrained(path)
-        policy.pretrained_path = path
-        made = chosen_convention(str(path), policy, None)
-        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=made)
-        assert {*env.observation_space["pixels"]} == {*cameras}
-        assert chosen_convention(str(path), policy, env.unwrapped.settings.convention) == convention
-        (other,) = {*CONVENTIONS} - {convention}
-        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=other)
-        with pytest.raises(MemobenchError, match=f"expects pictures of convention={convention}.*, and found {other}"):
-            chosen_convention(str(path), policy, env.unwrapped.settings.convention)
 
 
 @contextmanager

@@ -277,7 +277,7 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "mine_of_test").mkdir()
     (tmp_path / "mine_of_test" / "__init__.py").write_text(
         "from dataclasses import dataclass\n"
-        "from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig\n"
+        "from lerobot_memobench.policies.baselines import MemobenchRandomConfig\n"
         "from lerobot.configs import PreTrainedConfig\n"
         "@PreTrainedConfig.register_subclass('mine_of_test')\n@dataclass\n"
         "class Mine(MemobenchRandomConfig):\n    spread: float = 1.0\n    label: str = ''\n"

@@ -206,7 +206,7 @@ def conformance(
     """Check the memory of a policy. Rows are independent, reset forgets, the prompt reaches the memory, training has
     the history of a rollout, and more. Status 1 where a check fails.
     """
-    from lerobot_memobench.conformance.checks import Outcome, run_checks
+    from lerobot_memobench.conformance.checks import FAILED, run_checks
     from lerobot_memobench.conformance.subject import load_subject
 
     with tempfile.TemporaryDirectory() as folder:
@@ -216,7 +216,7 @@ def conformance(
     for result in results:
         rows.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
     console().print(rows)
-    failed = [result.check for result in results if result.outcome is Outcome.FAILED]
+    failed = [result.check for result in results if result.outcome is FAILED]
     say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
     return 1 if failed else 0
 

@@ -33,11 +33,7 @@ THINGS = 4
 def write_streams(
     folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
 ) -> Path:
-    """Write a dataset of three short episodes with the real columns and shapes and with synthetic values.
-
-    Args:
-        frames: of each execution. task: gives instruction and checkpoints. convention: of the pictures.
-    """
+    """Write a dataset of three episodes of few execution frames, with real columns and shapes and synthetic values."""
     episodes = (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS))
     return write_dataset(episodes, folder, convention=convention)
 
@@ -49,17 +45,14 @@ def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
         subgoals: instruction -> texts that the memory was trained with. If no task fits, `TASK` is returned.
     """
     known = {text for own in subgoals.values() for text in own}
-    found = [
-        task
-        for task in map(get_task, task_names(suite=None))
-        if task.language in subgoals and any(known.issuperset(texts) for texts in _texts_of_levels(task))
-    ]
+
+    def fits(task: Task) -> bool:
+        levels = zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
+        return task.language in subgoals and any(known.issuperset(texts) for texts in levels)
+
+    found = filter(fits, map(get_task, task_names(suite=None)))
     best = max(found, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
     return TASK if best is None else best.name
-
-
-def _texts_of_levels(task: Task) -> Iterator[tuple[str, ...]]:
-    return zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
 
 
 def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
@@ -76,7 +69,7 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
     slots = np.zeros((length, SLOTS, WIDTH), np.float32)
     position, rotation = STARTS["position"], STARTS["rotation"]
     for thing in range(THINGS):
-        slots[:, thing, : STARTS["position"]] = [1, 3 + thing]
+        slots[:, thing, :position] = [1, 3 + thing]
         slots[:, thing, position : position + 3] = [0, 0, 0.95] + 0.2 * moving(3)
         slots[:, thing, rotation : rotation + 6] = [1, 0, 0, 1, 0, 0]
     return Demonstration(
@@ -134,6 +127,10 @@ class Stream:
     def until(self, call: int) -> Stream:
         """Return the stream that ends after a call."""
         return replace(self, frames=self.frames[: call + 1])
+
+    def only(self, call: int) -> Stream:
+        """Return the stream of one observation."""
+        return Stream(self.frames[call : call + 1], self.task, self.indices[call : call + 1])
 
     def showing(self, other: Stream, calls: Sequence[int]) -> Stream:
         """Return the stream with another one's observations at some calls; phase and step stay its own."""

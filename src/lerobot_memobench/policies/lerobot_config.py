@@ -27,7 +27,7 @@ NOT_THE_CHECKPOINT = (
 
 ELSEWHERE = (
     *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
-    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+    *("host", "port", "servers", "connect_timeout", "timeout"),
 )
 """Settings of where a policy runs or is published; its actions do not depend on them."""
 
@@ -80,18 +80,14 @@ def has_device(device: str) -> bool:
 
     try:
         found = torch.device(device)
-        there = is_torch_device_available(found.type)
+        available = is_torch_device_available(found.type)
     except (RuntimeError, ValueError):  # there is no such type
         return False
-    return there and (found.type != "cuda" or (found.index or 0) < torch.cuda.device_count())
+    return available and (found.type != "cuda" or (found.index or 0) < torch.cuda.device_count())
 
 
 def check_device(device: str | None) -> None:
-    """Refuse a device that the user names and the machine lacks. LeRobot would run on another one.
-
-    Raises:
-        MemobenchError: the machine has no such device.
-    """
+    """Refuse a device that the user names and the machine lacks. LeRobot would run on another one."""
     if device is not None and device not in ("", "null", "~") and not has_device(device):
         raise MemobenchError(
             f"this machine has no device {device!r} that torch can use; leave the device out to use the best one, or "
@@ -120,14 +116,18 @@ def _identity(policy: Any, path: str | None) -> dict[str, Any]:
     """Return a policy's type and one hash over its checkpoint and the settings that differ from it."""
     weights = None if path is None else checkpoint_hash(path)
     with quiet():
-        default = _default_config(policy, path)
-    facts = json.dumps([policy.type, weights, _changes(policy, default)], sort_keys=True, default=str)
+        before = encoded(_default_config(policy, path))
+    changes = {
+        key: file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
+        for key, value in encoded(policy).items()
+        if key not in (*ELSEWHERE, "type") and before.get(key) != value
+    }
+    facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)
     found = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
     return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
 
 
 def _default_config(policy: Any, path: str | None) -> Any:
-    """Return the configuration of a checkpoint, or the default one of a type."""
     from lerobot.configs import PreTrainedConfig
 
     if path is not None:
@@ -136,16 +136,6 @@ def _default_config(policy: Any, path: str | None) -> Any:
         return type(policy)()
     except TypeError:  # a plugin with a required setting
         return policy
-
-
-def _changes(policy: Any, default: Any) -> dict[str, Any]:
-    """Return the settings that differ from the default; a file is represented by its hash."""
-    before, now = encoded(default), encoded(policy)
-    return {k: _content(v) for k, v in now.items() if k not in (*ELSEWHERE, "type") and before.get(k) != v}
-
-
-def _content(value: Any) -> Any:
-    return file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
 
 
 def checkpoint_hash(path: str) -> str:

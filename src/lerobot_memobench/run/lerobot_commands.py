@@ -70,8 +70,7 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     """
     from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY
     from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
-    from lerobot_memobench.policies.compatibility import check_actions
-    from lerobot_memobench.policies.convention import chosen_convention
+    from lerobot_memobench.policies.compatibility import check_actions, chosen_convention
     from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.run.command_line import PATH, parse_words, read_words
     from lerobot_memobench.sim.convention import MIRRORED

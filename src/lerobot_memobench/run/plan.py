@@ -21,8 +21,7 @@ from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
-from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.policies.compatibility import check_features, chosen_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,

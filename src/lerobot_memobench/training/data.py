@@ -42,8 +42,7 @@ from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
-from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.convention import trained_convention
+from lerobot_memobench.policies.compatibility import check_features, trained_convention
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ANSWERS,
     PROGRESS,

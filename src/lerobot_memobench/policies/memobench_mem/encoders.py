@@ -17,7 +17,7 @@ from torch.nn.functional import interpolate, rms_norm
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
-from lerobot_memobench.policies.compatibility import cure
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 
 if TYPE_CHECKING:
@@ -288,7 +288,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         if encoded_key(camera) in batch:
             return batch[encoded_key(camera)]
         if camera not in batch:
-            raise MemobenchError(f"The observation has no '{camera}', which this policy reads; {cure(camera, batch)}")
+            raise MemobenchError(f"The observation has no '{camera}', which this policy reads; {hint(camera, batch)}")
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:

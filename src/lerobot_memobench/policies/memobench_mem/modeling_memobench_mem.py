@@ -24,7 +24,7 @@ from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
-from lerobot_memobench.policies.compatibility import cure
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,
     load_base_weights,
@@ -316,7 +316,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         name = self.perception.memory_input
         if name not in batch:
             what = f"'{name}'" if name else "picture"
-            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {cure(name, batch)}")
+            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {hint(name, batch)}")
         steps = _column(batch, OBS_STEP)
         phases = None if steps is None else _column(batch, OBS_PHASE)
         steps = steps or [self._calls] * len(batch[name])

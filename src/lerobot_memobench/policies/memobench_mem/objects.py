@@ -20,7 +20,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.objects import ObjectLocalizer, upright
 from lerobot_memobench.perception.visual_encoder import SIDE
-from lerobot_memobench.policies.compatibility import cure
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ENCODED,
     TOKEN_SCALE,
@@ -240,7 +240,7 @@ class ObjectsFromPictures:
         for name in VIEWS:
             if name not in pictures:
                 raise MemobenchError(
-                    f"The observation has no '{name}', which the detector reads; {cure(name, pictures)}"
+                    f"The observation has no '{name}', which the detector reads; {hint(name, pictures)}"
                 )
         device = next(self._detector.parameters()).device
         views = {camera: pictures[name].to(device) for name, camera in VIEWS.items()}

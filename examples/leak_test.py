@@ -1,11 +1,11 @@
 """Tests that no state of a LeRobot policy leaks between rows, episodes or instances; without a simulator.
 
-    POLICY_FACTORY=package.module:function python -m pytest --pyargs lerobot_memobench.conformance.leak_test
+    POLICY_FACTORY=package.module:function python -m pytest examples/leak_test.py
 
 The function returns the policy, or the policy and a function that returns the observation of one row, drawn from a
 generator (by default random numbers in the shapes of ``config.input_features``). Without ``POLICY_FACTORY`` the tests
-run on small instances of LeRobot's act and diffusion. The file imports no other file of its package: copy it into your
-own tests, and add your factory to `FACTORIES`.
+run on small instances of LeRobot's act and diffusion. The file imports nothing of this project: copy it into your own
+tests, and add your factory to `FACTORIES`.
 """
 
 from __future__ import annotations
