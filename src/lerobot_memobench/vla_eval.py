@@ -23,7 +23,7 @@ from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
+from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, rollout_value
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
@@ -261,7 +261,7 @@ class MEMOBench(StepBenchmark):
                 env.task,
             )
         record = env.record()
-        values = {metric: value_of(record, metric) for metric in PROCESS_METRICS}
+        values = {metric: rollout_value(record, metric) for metric in PROCESS_METRICS}
         return {
             SUCCESS: record[SUCCESS],
             **{metric: value for metric, value in values.items() if value is not None},

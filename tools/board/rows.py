@@ -9,10 +9,10 @@ from pathlib import Path
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.episode_log import INPUTS
-from lerobot_memobench.evaluation.comparison import Contrast, compare
+from lerobot_memobench.evaluation.comparison import Contrast, compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import Rate, Row, stand_ins_of
-from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, figure, with_interval
+from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
 from lerobot_memobench.io import checked, parsed
 from tools.board.check import RERUNS, ranked, read_board
 from tools.board.submission import Submission
@@ -70,7 +70,7 @@ def board_row(
     protocol, run = evaluation.protocol, evaluation.run
     changes: tuple[Contrast, ...] = ()
     if PAUSES in controls:
-        changes = compare(run, controls[PAUSES].run, permutations=100).contrasts
+        changes = compare_evaluations(run, controls[PAUSES].run, permutations=100).contrasts
     partner = next((each for each in others if each.name == submission.about.without_memory), None)
     return BoardRow(
         name=submission.name,
@@ -104,7 +104,7 @@ def evidence_text(found: Evidence | None) -> str:
     if found is None:
         return NOT_APPLICABLE
     follows = found.rates["follows"]
-    return f"{with_interval(follows.value, follows.low, follows.high)}, chance {figure(found.chance)}"
+    return f"{with_interval(follows.value, follows.low, follows.high)}, chance {percent_text(found.chance)}"
 
 
 def pauses_text(found: Contrast | None) -> str:
@@ -112,4 +112,4 @@ def pauses_text(found: Contrast | None) -> str:
     if found is None:
         return NOT_APPLICABLE
     low, high = found.interval
-    return f"{figure(found.value, sign=True)} [{figure(low)} to {figure(high)}]"
+    return f"{percent_text(found.value, sign=True)} [{percent_text(low)} to {percent_text(high)}]"

@@ -89,13 +89,13 @@ def export(
     ] = None,
 ) -> None:
     """Export a result for the page of a model on the Hugging Face hub, .eval_results/memobench.yaml."""
-    from lerobot_memobench.evaluation.huggingface import FILE, huggingface_yaml
     from lerobot_memobench.evaluation.records import read_runs
+    from lerobot_memobench.evaluation.report import HUB_FILE, huggingface_yaml
 
     (run,) = read_runs([card])
     text = huggingface_yaml(run, dataset)
     if out is None:
         print(text, end="")
         return
-    (out / FILE).parent.mkdir(parents=True, exist_ok=True)
-    say(write_file(out / FILE, text))
+    (out / HUB_FILE).parent.mkdir(parents=True, exist_ok=True)
+    say(write_file(out / HUB_FILE, text))

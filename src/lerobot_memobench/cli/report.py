@@ -62,13 +62,13 @@ def report(
     report.json and report.md are also written to the folder of each evaluation, unless its log is compressed.
     """
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report import build
+    from lerobot_memobench.evaluation.report import evaluation_report
 
     runs = read_runs(folders)
     for run in runs:
         for each in run.evaluations:
             _write_next_to_log(each)
-    show_report(build(runs), "report", format_, out)
+    show_report(evaluation_report(runs), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
 
@@ -116,12 +116,11 @@ def compare(
 
     Evaluations that differ in the setting of a control (pauses, corrupted memory, interference, …) are reported as it.
     """
-    from lerobot_memobench.evaluation.comparison import compare as compared
-    from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report
+    from lerobot_memobench.evaluation.comparison import compare_evaluations, comparison_csv, comparison_report
     from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
-    found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    found = compare_evaluations(first, second, allow=allow or (), seed=seed, permutations=permutations)
     show_report(comparison_report(found), "compare", format_, out, comparison_csv(found))
 
 

@@ -14,24 +14,24 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
-from lerobot_memobench.envs.settings import SETTINGS
+from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, POLICY, differences
+from lerobot_memobench.envs.settings import INTACT, SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.agreement import SCENES
-from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
+    PROCESS_METRICS,
     SUITE,
     Record,
     by_task,
+    inputs_phrase,
     operations,
     percent,
-    policy_inputs,
     prefix,
+    rollout_value,
     satisfied,
-    value_of,
     varies,
 )
 from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
@@ -57,7 +57,7 @@ from lerobot_memobench.evaluation.tables import (
     Section,
     Table,
     csv_text,
-    figure,
+    percent_text,
     with_ids,
 )
 from lerobot_memobench.io import count_of
@@ -69,6 +69,153 @@ ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
 """Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]
+
+
+# --- controls ---
+
+LEAST_GAP = 0.01
+"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A setting in which two evaluations differ on purpose.
+
+    Attributes:
+        title: name of the control.
+        setting: key of the protocol, or of the policy's settings where ``of_policy``.
+        default: its value in the first evaluation; the second has another.
+        meaning: how to read the difference.
+        of_policy: whether the policy's training, not the evaluation, has the setting.
+        one_policy: whether both evaluations have to be of one policy.
+        gap_closed: whether the share of the gap to 100 % is reported.
+        by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
+        value: the setting's only value that is the control; None: every value but the default.
+        also: settings that may differ as well, because they are parts of the control.
+    """
+
+    title: str
+    setting: str
+    default: Any
+    meaning: str
+    of_policy: bool = False
+    one_policy: bool = False
+    gap_closed: bool = False
+    by_checkpoint: bool = False
+    value: Any = None
+    also: tuple[str, ...] = ()
+
+    def value_in(self, run: Run) -> Any:
+        """Return the setting's value in an evaluation, the default where its log does not record it."""
+        known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
+        value = known.get(self.setting, self.default)
+        return value if self.value in (None, value) else self.default
+
+
+CONTROLS = (
+    Control(
+        "Pauses",
+        "pause_steps",
+        0,
+        "The robot rests at times that the seed draws. The policy observes and does the same, only later. A policy "
+        "that reads a clock loses; a policy that remembers events does not.",
+        one_policy=True,
+    ),
+    Control(
+        "Slower actions",
+        "speed",
+        1.0,
+        "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
+        "remembers events loses no more than the expert.",
+        one_policy=True,
+    ),
+    Control(
+        "Corrupted memory",
+        "corrupt",
+        INTACT,
+        "The memory of the second evaluation's policy was deleted, swapped or made noisy once, at corrupt_step. "
+        "Metrics that do not fall do not depend on the memory before that step. With reshow the evidence was shown "
+        "again: a policy that recovers falls less than without it.",
+        one_policy=True,
+        also=("corrupt_step", "reshow"),
+    ),
+    Control(
+        "Prompt shown again",
+        "reshow",
+        False,
+        "The demonstration prompt plays twice in the second evaluation. After a corruption of the memory, a gain is "
+        "the policy's recovery; without one, a change is the effect of the longer prompt alone.",
+        one_policy=True,
+    ),
+    Control(
+        "Interference",
+        "interference",
+        0,
+        "In the second evaluation the policy observes episodes of other tasks between prompt and execution, without "
+        "a reset. A memory of the latest frames loses the prompt; a memory that selects by the task keeps it.",
+        one_policy=True,
+    ),
+    Control(
+        "Oracle memory",
+        "oracle_memory",
+        False,
+        "The second policy reads the true memory content. Gap closed is (second − first) / (100 − first): the share "
+        "that a perfect memory would recover. It is left out where the gap is under one point.",
+        gap_closed=True,
+    ),
+    Control(
+        "Shuffled memory",
+        "align_targets",
+        "subgoals",
+        "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
+        "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
+        "satisfied.",
+        of_policy=True,
+        by_checkpoint=True,
+        value="shuffled",
+    ),
+)
+
+
+def control_between(a: Run, b: Run) -> Control | None:
+    """Return the control that two evaluations are, None where none of `CONTROLS` differs.
+
+    Raises:
+        MemobenchError: the evaluation with the control comes first, or they are of two policies.
+    """
+    for control in CONTROLS:
+        first, second = control.value_in(a), control.value_in(b)
+        if first == second:
+            continue
+        if first != control.default:
+            raise MemobenchError(
+                f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
+                f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
+            )
+        if control.one_policy:
+            _check_one_policy(a, b)
+        return control
+    return None
+
+
+def _check_one_policy(a: Run, b: Run) -> None:
+    for key in ("type", "sha256"):
+        mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
+        if mine and other and mine != other:
+            raise MemobenchError(
+                f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
+                "expected one policy with and without the control"
+            )
+
+
+def oracle_share(first: float | None, second: float | None) -> float | None:
+    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
+
+    It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
+    """
+    if first is None or second is None or 1.0 - first < LEAST_GAP:
+        return None
+    return (second - first) / (1.0 - first)
 
 
 # --- pairs of rollouts ---
@@ -226,7 +373,7 @@ class Comparison:
         return f"{self.control.title}: {names}" if self.control else names
 
 
-def compare(
+def compare_evaluations(
     a: Run,
     b: Run,
     *,
@@ -256,7 +403,7 @@ def compare(
         pairs=len(pairs),
         contrasts=tuple(_contrasts(pairs, control, np.random.default_rng(seed), permutations)),
         notes=notes,
-        inputs={run.name: policy_inputs(run.records) for run in (a, b)},
+        inputs={run.name: inputs_phrase(run.records) for run in (a, b)},
         headline=headline([a, b]),
         control=control,
     )
@@ -267,7 +414,7 @@ def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
     for a, b in ordered(runs, 2):
         try:
             if control_between(a, b) is not None:
-                yield compare(a, b)
+                yield compare_evaluations(a, b)
         except MemobenchError:  # reversed, of two policies, or of other protocols: no control
             continue
 
@@ -297,7 +444,9 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     tasks = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
-        values = {metric: np.array([[value_of(r, metric) for r in pair] for pair in both], float) for metric in METRICS}
+        values = {
+            metric: np.array([[rollout_value(r, metric) for r in pair] for pair in both], float) for metric in METRICS
+        }
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
@@ -379,7 +528,7 @@ def _contrast(
     a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
     d = after - before
     only_a = only_b = None
-    if metric in METRICS[1:]:
+    if metric in PROCESS_METRICS:
         p, exact = sign_flip(d, weights, rng, permutations)
     else:
         only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
@@ -407,8 +556,8 @@ def _mean(values: Sequence[float]) -> float:
 
 def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
     """Return the share of the gap that is closed, with its interval where the gap seldom vanishes in the draws."""
-    value = gap_closed(a, b)
-    shares = [share for pair in drawn.tolist() if (share := gap_closed(*pair)) is not None]
+    value = oracle_share(a, b)
+    shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
     if value is None or len(shares) <= 0.9 * len(drawn):
         return Estimate(value)
     least, most = (bound / (1.0 - a) for bound in bounds)
@@ -509,7 +658,7 @@ def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
-    return Numbers(figure(value, signed).replace("-", "−"))
+    return Numbers(percent_text(value, signed).replace("-", "−"))
 
 
 def _interval(row: Contrast) -> str:

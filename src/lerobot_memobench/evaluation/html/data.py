@@ -27,8 +27,7 @@ from lerobot_memobench.evaluation.metrics import (
     percent,
 )
 from lerobot_memobench.evaluation.records import Run, unlike
-from lerobot_memobench.evaluation.report import build
-from lerobot_memobench.evaluation.report_tables import outcomes
+from lerobot_memobench.evaluation.report import evaluation_report, outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import count_of
 from lerobot_memobench.policies.memory_reads import Chunk
@@ -76,7 +75,7 @@ def page_data(
         "failures": list(dict.fromkeys(name for run in runs for name in run.summary.failures)),
         "tasks": tasks_data([record for run in runs for record in run.records], known),
         "runs": [
-            run_data(run, addresses, of_run, controls[run.name])
+            evaluation_on_page(run, addresses, of_run, controls[run.name])
             for run, addresses, of_run in zip(runs, videos, reads or [{}] * len(runs), strict=True)
         ],
     }
@@ -116,7 +115,7 @@ def _variant(record: Record) -> int:
 # --- runs ---
 
 
-def run_data(
+def evaluation_on_page(
     run: Run, videos: Mapping[int, str], reads: Mapping[int, Sequence[Chunk]], controls: Sequence[str]
 ) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
@@ -128,7 +127,7 @@ def run_data(
         "facts": [*facts(run), *controls],
         "commands": [shlex.join(start["command"]) for start in starts if start.get("command")],
         "notes": list(run.notes),
-        "csv": csv_tables(build([run])),
+        "csv": csv_tables(evaluation_report([run])),
         "average": row_data(summary.average) if summary.means else None,
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {name: task_data(name, summary) for name in summary.tasks},
