@@ -17,7 +17,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import STATED
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.html import write_html
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.evaluation.tables import WRITERS

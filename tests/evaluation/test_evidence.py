@@ -13,7 +13,7 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import evidence_of
-from lerobot_memobench.evaluation.html.data import facts
+from lerobot_memobench.evaluation.html import facts
 from lerobot_memobench.evaluation.metrics import summary_of
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task

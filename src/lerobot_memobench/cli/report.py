@@ -75,7 +75,7 @@ def report(
         for path in draw_figures(runs, figures):
             say(path)
     if html is not None:
-        from lerobot_memobench.evaluation.html.write import write_html
+        from lerobot_memobench.evaluation.html import write_html
 
         written = write_html(folders, html, task_dir)
         for line in written.notes:

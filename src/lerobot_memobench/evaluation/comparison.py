@@ -7,6 +7,7 @@ control (`controls`) are that control: the setting may differ, and the report ex
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
 from typing import Any, Literal, NamedTuple
@@ -79,10 +80,9 @@ LEAST_GAP = 0.01
 
 @dataclass(frozen=True)
 class Control:
-    """A setting in which two evaluations differ on purpose.
+    """A setting in which two evaluations differ on purpose, to test for memory.
 
     Attributes:
-        title: name of the control.
         setting: key of the protocol, or of the policy's settings where ``of_policy``.
         default: its value in the first evaluation; the second has another.
         meaning: how to read the difference.
@@ -192,20 +192,15 @@ def control_between(a: Run, b: Run) -> Control | None:
                 f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
                 f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
             )
-        if control.one_policy:
-            _check_one_policy(a, b)
+        for key in ("type", "sha256") if control.one_policy else ():
+            mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
+            if mine and other and mine != other:
+                raise MemobenchError(
+                    f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
+                    "expected one policy with and without the control"
+                )
         return control
     return None
-
-
-def _check_one_policy(a: Run, b: Run) -> None:
-    for key in ("type", "sha256"):
-        mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
-        if mine and other and mine != other:
-            raise MemobenchError(
-                f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
-                "expected one policy with and without the control"
-            )
 
 
 def oracle_share(first: float | None, second: float | None) -> float | None:
@@ -412,11 +407,9 @@ def compare_evaluations(
 def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
     """Yield the comparison of each two evaluations that differ only in the setting of a control."""
     for a, b in ordered(runs, 2):
-        try:
+        with suppress(MemobenchError):  # reversed, of two policies, or of other protocols: no control
             if control_between(a, b) is not None:
                 yield compare_evaluations(a, b)
-        except MemobenchError:  # reversed, of two policies, or of other protocols: no control
-            continue
 
 
 # --- tasks and scopes ---
@@ -430,7 +423,7 @@ class _Sample(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """The pairs of one task; ``samples`` has the metrics that apply to it."""
+    """The pairs of one task, and the metrics that apply to it."""
 
     name: str
     memory_type: str
@@ -501,7 +494,7 @@ def _contrasts(
         for metric in groups[0][0].samples if kind == "task" else METRICS:
             samples = [[task.samples[metric] for task in group if metric in task.samples] for group in groups]
             if applicable := [group for group in samples if group]:
-                contrasts.append(_contrast(kind, scope, metric, applicable, rng, permutations, closes))
+                contrasts.append(_contrast((kind, scope), metric, applicable, rng, permutations, closes))
     for metric in METRICS:
         of_tasks = [k for k, each in enumerate(contrasts) if each.metric == metric and each.kind == "task"]
         for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
@@ -510,8 +503,7 @@ def _contrasts(
 
 
 def _contrast(
-    kind: Kind,
-    scope: str,
+    scope: tuple[Kind, str],
     metric: str,
     groups: list[list[_Sample]],
     rng: np.random.Generator,
@@ -534,8 +526,7 @@ def _contrast(
         only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
         p = mcnemar(only_a, only_b)
     return Contrast(
-        kind=kind,
-        scope=scope,
+        *scope,
         metric=metric,
         n=len(d),
         a=a,
