@@ -14,7 +14,7 @@ from published import RAW, PublishedRow, published_rows
 
 from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.settings import PICTURES
-from lerobot_memobench.evaluation.comparison import oracle_share
+from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, read_runs

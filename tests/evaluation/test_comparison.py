@@ -43,7 +43,7 @@ def folder(path: Path, reached: list[int], task: str = STOVE, operations: str = 
 def test_counted_by_hand(tmp_path: Path) -> None:
     """Of 8 episodes of each of two tasks, A solves the first 2 and B the first 5."""
     found = compared(logs.evaluation(tmp_path / "a", 2, 8), logs.evaluation(tmp_path / "b", 5, 8))
-    assert (found.pairs, found.notes, found.control) == (16, (), None)
+    assert (found.pairs, found.notes, found.control) == (16, [], None)
     average = find(found, "average of memory types", "SR")
     assert (average.a, average.b, average.only_a, average.only_b) == (0.25, 0.625, 0, 6)
     assert (average.p, average.value) == (2 / 64, 0.375)

@@ -12,7 +12,7 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import oracle_share
+from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.report import with_labels_of
 from tests.support.logs import SETTINGS, rollout
 

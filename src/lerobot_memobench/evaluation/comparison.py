@@ -15,10 +15,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, POLICY, differences
-from lerobot_memobench.envs.settings import INTACT, SETTINGS
+from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
+from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.evaluation.agreement import SCENES
+from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
@@ -70,147 +71,6 @@ ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
 """Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]
-
-
-# --- controls ---
-
-LEAST_GAP = 0.01
-"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
-
-
-@dataclass(frozen=True)
-class Control:
-    """A setting in which two evaluations differ on purpose, to test for memory.
-
-    Attributes:
-        setting: key of the protocol, or of the policy's settings where ``of_policy``.
-        default: its value in the first evaluation; the second has another.
-        meaning: how to read the difference.
-        of_policy: whether the policy's training, not the evaluation, has the setting.
-        one_policy: whether both evaluations have to be of one policy.
-        gap_closed: whether the share of the gap to 100 % is reported.
-        by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
-        value: the setting's only value that is the control; None: every value but the default.
-        also: settings that may differ as well, because they are parts of the control.
-    """
-
-    title: str
-    setting: str
-    default: Any
-    meaning: str
-    of_policy: bool = False
-    one_policy: bool = False
-    gap_closed: bool = False
-    by_checkpoint: bool = False
-    value: Any = None
-    also: tuple[str, ...] = ()
-
-    def value_in(self, run: Run) -> Any:
-        """Return the setting's value in an evaluation, the default where its log does not record it."""
-        known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
-        value = known.get(self.setting, self.default)
-        return value if self.value in (None, value) else self.default
-
-
-CONTROLS = (
-    Control(
-        "Pauses",
-        "pause_steps",
-        0,
-        "The robot rests at times that the seed draws. The policy observes and does the same, only later. A policy "
-        "that reads a clock loses; a policy that remembers events does not.",
-        one_policy=True,
-    ),
-    Control(
-        "Slower actions",
-        "speed",
-        1.0,
-        "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
-        "remembers events loses no more than the expert.",
-        one_policy=True,
-    ),
-    Control(
-        "Corrupted memory",
-        "corrupt",
-        INTACT,
-        "The memory of the second evaluation's policy was deleted, swapped or made noisy once, at corrupt_step. "
-        "Metrics that do not fall do not depend on the memory before that step. With reshow the evidence was shown "
-        "again: a policy that recovers falls less than without it.",
-        one_policy=True,
-        also=("corrupt_step", "reshow"),
-    ),
-    Control(
-        "Prompt shown again",
-        "reshow",
-        False,
-        "The demonstration prompt plays twice in the second evaluation. After a corruption of the memory, a gain is "
-        "the policy's recovery; without one, a change is the effect of the longer prompt alone.",
-        one_policy=True,
-    ),
-    Control(
-        "Interference",
-        "interference",
-        0,
-        "In the second evaluation the policy observes episodes of other tasks between prompt and execution, without "
-        "a reset. A memory of the latest frames loses the prompt; a memory that selects by the task keeps it.",
-        one_policy=True,
-    ),
-    Control(
-        "Oracle memory",
-        "oracle_memory",
-        False,
-        "The second policy reads the true memory content. Gap closed is (second − first) / (100 − first): the share "
-        "that a perfect memory would recover. It is left out where the gap is under one point.",
-        gap_closed=True,
-    ),
-    Control(
-        "Shuffled memory",
-        "align_targets",
-        "subgoals",
-        "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
-        "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
-        "satisfied.",
-        of_policy=True,
-        by_checkpoint=True,
-        value="shuffled",
-    ),
-)
-
-
-def control_between(a: Run, b: Run) -> Control | None:
-    """Return the control that two evaluations are, None where none of `CONTROLS` differs.
-
-    Raises:
-        MemobenchError: the evaluation with the control comes first, or they are of two policies.
-    """
-    for control in CONTROLS:
-        first, second = control.value_in(a), control.value_in(b)
-        if first == second:
-            continue
-        if first != control.default:
-            raise MemobenchError(
-                f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
-                f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
-            )
-        for key in ("type", "sha256") if control.one_policy else ():
-            mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
-            if mine and other and mine != other:
-                raise MemobenchError(
-                    f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
-                    "expected one policy with and without the control"
-                )
-        return control
-    return None
-
-
-def oracle_share(first: float | None, second: float | None) -> float | None:
-    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
-
-    It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
-    """
-    if first is None or second is None or 1.0 - first < LEAST_GAP:
-        return None
-    return (second - first) / (1.0 - first)
 
 
 # --- pairs of rollouts ---
@@ -344,37 +204,35 @@ class Comparison:
     """Two evaluations over the episodes that both hold.
 
     Attributes:
-        a, b: their names.
-        pairs: number of episodes.
+        runs: both, with these episodes alone.
         notes: warnings for the reader.
-        inputs: name of an evaluation -> inputs of its policy.
-        headline: the report's first line.
         control: the control that they are, if any.
     """
 
-    a: str
-    b: str
-    pairs: int
-    contrasts: tuple[Contrast, ...]
-    notes: tuple[str, ...]
-    inputs: Mapping[str, str]
-    headline: str
+    runs: tuple[Run, Run]
+    contrasts: Sequence[Contrast]
+    notes: Sequence[str]
     control: Control | None = None
+
+    @property
+    def pairs(self) -> int:
+        """The number of common episodes."""
+        return len(self.runs[0].records)
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Name of an evaluation -> inputs of its policy."""
+        return {run.name: inputs_phrase(run.records) for run in self.runs}
 
     @property
     def title(self) -> str:
         """The control, where it is one, and the names of both."""
-        names = f"{self.b} against {self.a}"
+        names = f"{self.runs[1].name} against {self.runs[0].name}"
         return f"{self.control.title}: {names}" if self.control else names
 
 
 def compare_evaluations(
-    a: Run,
-    b: Run,
-    *,
-    allow: Collection[str] = (),
-    seed: int = 0,
-    permutations: int = PERMUTATIONS,
+    a: Run, b: Run, *, allow: Collection[str] = (), seed: int = 0, permutations: int = PERMUTATIONS
 ) -> Comparison:
     """Compare two evaluations over the episodes that both hold.
 
@@ -390,18 +248,9 @@ def compare_evaluations(
     if other_hashes(a.protocol, b.protocol):
         allowed.add(SCENES)
     pairs = _paired(a, b, allowed)
-    notes = tuple(_notes(a, b, pairs, control))
-    a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
-    return Comparison(
-        a=a.name,
-        b=b.name,
-        pairs=len(pairs),
-        contrasts=tuple(_contrasts(pairs, control, np.random.default_rng(seed), permutations)),
-        notes=notes,
-        inputs={run.name: inputs_phrase(run.records) for run in (a, b)},
-        headline=headline([a, b]),
-        control=control,
-    )
+    contrasts = _contrasts(pairs, control, np.random.default_rng(seed), permutations)
+    first, second = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
+    return Comparison((first, second), contrasts, _notes(a, b, pairs, control), control)
 
 
 def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
@@ -575,7 +424,7 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 def comparison_report(comparison: Comparison) -> Report:
     """Return a comparison as tables and JSON values."""
     section = comparison_section(comparison)
-    title = f"{section.title}: {comparison.headline}"
+    title = f"{section.title}: {headline(comparison.runs)}"
     return Report(title, [replace(section, title="")], comparison_data(comparison))
 
 
@@ -602,10 +451,10 @@ def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, 
     """
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
-        "a": comparison.a,
-        "b": comparison.b,
+        "a": comparison.runs[0].name,
+        "b": comparison.runs[1].name,
         "control": comparison.control.setting if comparison.control else None,
-        "inputs": dict(comparison.inputs),
+        "inputs": comparison.inputs,
         "pairs": comparison.pairs,
         "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
         "notes": list(comparison.notes),
@@ -630,8 +479,8 @@ def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]
     columns: list[tuple[str, Callable[[Contrast], Cell]]] = [
         ("metric", lambda row: row.metric),
         ("pairs", lambda row: row.n),
-        (comparison.a, lambda row: _points(row.a)),
-        (comparison.b, lambda row: _points(row.b)),
+        (comparison.runs[0].name, lambda row: _points(row.a)),
+        (comparison.runs[1].name, lambda row: _points(row.b)),
         ("difference", lambda row: _points(row.value, True)),
         ("95 %", lambda row: Numbers(_interval(row))),
         ("only one", lambda row: Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}")),

@@ -255,7 +255,7 @@ def page_data(
     """
     controls: dict[str, list[str]] = {run.name: [] for run in runs}
     for each in controls_among(runs):
-        controls[each.b].append(comparison_phrase(each))
+        controls[each.runs[1].name].append(comparison_phrase(each))
     return {
         "version": __version__,
         "notices": unlike(runs),
