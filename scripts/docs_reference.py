@@ -666,8 +666,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Adapt the links of a page that leave ``docs``, and fill in the board (called by MkDocs)."""
     found = relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
     if page.file.src_uri == BOARD_PAGE:
-        board = runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
-        found = found.replace(board["PLACE"], board["table"]())
+        from tools.board.page import PLACE
+        from tools.board.page import table as board_table
+
+        found = found.replace(PLACE, board_table())
     return found
 
 

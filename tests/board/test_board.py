@@ -13,8 +13,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.board.pull_request import PROMISES
-from lerobot_memobench.board.submission import CARD, LOG, About, write_submission
+from lerobot_memobench.board.submission import CARD, LOG, PROMISES, About, write_submission
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
@@ -33,10 +32,9 @@ from tests.support.board import (
     sealed,
     stating,
 )
-from tests.support.scripts import load_script
+from tools.board import page
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_partners, check_paths, check_submission, ranked, read_board
-from tools.board.rows import board_row, board_rows
 from tools.board.submission import read_submission
 
 ROOT = Path(__file__).parents[2]
@@ -68,13 +66,13 @@ def with_controls(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def test_valid_submission_is_accepted(board: Path) -> None:
-    (row,) = board_rows(board)
+    (row,) = page.board_rows(board)
     assert (row.ranked, row.rerun, row.episodes, row.suite, row.inputs) == (False, False, 10, "strict", "pixels")
     assert row.rates["SR"].value == pytest.approx(0.6)
 
 
 def test_board_of_the_repository_is_valid() -> None:
-    rows = board_rows(ROOT / "results" / "board")
+    rows = page.board_rows(ROOT / "results" / "board")
     assert {row.name: row.rerun for row in rows} == dict.fromkeys((row.name for row in rows), True)
     assert {row.name: f"{row.rates['SR'].value:.4f}" for row in rows}["memobench_expert_libero"] == "0.9930"
 
@@ -211,7 +209,7 @@ def each_variant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_row_of_each_scene_with_each_variant_ranks(each_variant: Path) -> None:
     check_submission(found := read_submission(each_variant))
-    row = board_row(found)
+    row = page.board_row(found)
     assert (row.ranked, row.episodes, row.seeds) == (True, 36, "paper")
     assert row.rates["SR"].value == pytest.approx(2 / 3)
     assert row.evidence is not None
@@ -262,7 +260,7 @@ def test_sealed_result_is_accepted(board: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(board / "one", tmp_path / "one")
     sealed(folder)
     check_submission(found := read_submission(folder))
-    assert board_row(found).seeds == "sealed"
+    assert page.board_row(found).seeds == "sealed"
 
 
 @pytest.mark.parametrize(
@@ -324,11 +322,10 @@ def test_row_with_controls(with_controls: Path, board: Path, tmp_path: Path) -> 
     folder = shutil.copytree(with_controls, tmp_path / "two")
     others = read_board(board)
     check_submission(found := read_submission(folder), others)
-    row = board_row(found, others)
+    row = page.board_row(found, others)
     assert row.pauses is not None
     assert row.without_memory is not None
     assert (row.pauses.value, row.without_memory.value) == (0.0, pytest.approx(0.6))
-    page = load_script("board_page")
     html = page._line(None, row)
     assert '<tr class="unverified">' in html
     assert html.count("<td") == len(page.HEAD) == page.table().split("</tr>")[1].count("<td")

@@ -31,7 +31,7 @@ from tests.support.board import (
 )
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_author, check_paths, check_submission, read_board
-from tools.board.rows import board_rows
+from tools.board.page import board_rows
 from tools.board.submission import read_submission
 
 Json = dict[str, Any]

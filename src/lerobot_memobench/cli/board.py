@@ -40,7 +40,6 @@ def submit(
 
     It consists of a folder for results/board and the text of a pull request.
     """
-    from lerobot_memobench.board.pull_request import pull_request
     from lerobot_memobench.board.rules import check_control, check_evaluation
     from lerobot_memobench.board.submission import (
         BOARD,
@@ -49,6 +48,7 @@ def submit(
         About,
         RowName,
         own_evaluation,
+        pull_request,
         write_submission,
     )
     from lerobot_memobench.io import checked, count_of
