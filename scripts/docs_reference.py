@@ -1,12 +1,10 @@
 """Generate reference pages and task cards of the site, and adapt links that leave ``docs``: a hook of MkDocs.
 
-The pages are not committed. ``python scripts/docs_reference.py FOLDER`` writes them to a folder. Policy configurations
-are read from their source, without importing torch.
+The pages are not committed. Policy configurations are read from their source, without importing torch.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import html
@@ -673,7 +671,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return found
 
 
-def breakable(page: str) -> str:
+def on_page_content(content: str, **_: Any) -> str:
     """Allow line breaks in table cells after ``_``, ``.``, ``/`` and ``=`` of names, and prevent them in intervals."""
 
     def break_cell(match: re.Match[str]) -> str:
@@ -682,23 +680,4 @@ def breakable(page: str) -> str:
         cell = re.sub(r"\[[\d.]+–[\d.]+\]", r'<span class="interval">\g<0></span>', "".join(parts))
         return match[1] + cell + match[3]
 
-    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, page, flags=re.DOTALL)
-
-
-def on_page_content(content: str, **_: Any) -> str:
-    """Let wide tables fit (called by MkDocs)."""
-    return breakable(content)
-
-
-def main() -> None:
-    """Write the generated pages into the given folder."""
-    parser = argparse.ArgumentParser(description="Write the generated pages of the site into a folder.")
-    parser.add_argument("folder", type=Path)
-    out = parser.parse_args().folder
-    for path, make in PAGES.items():
-        (out / path).parent.mkdir(parents=True, exist_ok=True)
-        (out / path).write_text(make())
-
-
-if __name__ == "__main__":
-    main()
+    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, content, flags=re.DOTALL)
