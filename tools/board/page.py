@@ -124,7 +124,6 @@ def table() -> str:
 
 
 def _line(rank: int | None, row: BoardRow) -> str:
-    """Return the HTML of one row; a row that was not rerun is grey."""
     about = row.about
     links = " ".join(f'<a href="{escape(link)}" rel="nofollow noopener">{key}</a>' for key, link in about.links.items())
     policy = f"{escape(about.model)}<br><small>{escape(about.submitter)}, {about.date}{links and f', {links}'}</small>"

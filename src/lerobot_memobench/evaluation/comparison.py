@@ -272,8 +272,6 @@ class _Sample(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """The pairs of one task, and the metrics that apply to it."""
-
     name: str
     memory_type: str
     family: str | None
@@ -359,7 +357,6 @@ def _contrast(
     permutations: int,
     closes: bool,
 ) -> Contrast:
-    """Return the contrast of one metric in one scope, weighted as the report weights."""
     values = [sample.values for group in groups for sample in group]
     sizes = [len(groups) * len(group) * len(sample.values) for group in groups for sample in group]
     before, after = np.concatenate(values).T
@@ -473,7 +470,6 @@ def comparison_csv(comparison: Comparison) -> str:
 
 
 def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
-    """Return a row per metric; only the first of a scope names it."""
     rows = [row for row in comparison.contrasts if row.kind in kinds]
     of_tasks, closes = "task" in kinds, any(row.closed is not None for row in rows)
     columns: list[tuple[str, Callable[[Contrast], Cell]]] = [

@@ -129,12 +129,10 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
 
 
 def _by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Return the rollouts of tasks with several variants that record a choice, by task."""
     return by_task(record for record in records if "choice" in record and varies(record))
 
 
 def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
-    """Return the rollouts of each scene of a task that was run with every variant."""
     scenes: dict[int, dict[int, Record]] = {}
     for record in group:
         scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record

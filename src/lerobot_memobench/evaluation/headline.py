@@ -70,7 +70,6 @@ def protocol_phrases(run: Run) -> list[str]:
 
 
 def _seeds(run: Run) -> list[str]:
-    """Return the seeds, and the split that they are of where it is not the paper's."""
     logged = {record["seed"] for record in run.records if record.get("seed") is not None}
     if not logged:
         return []

@@ -124,7 +124,6 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
 
 
 def _slugs(names: Sequence[str]) -> list[str]:
-    """Return for each name that of a folder: plain characters, all distinct."""
     slugs: dict[str, str] = {}  # in lower case, since some file systems ignore case
     for name in names:
         base = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
@@ -135,7 +134,6 @@ def _slugs(names: Sequence[str]) -> list[str]:
 
 
 def _check_target(out: Path) -> None:
-    """Refuse a folder that holds other files than a report's."""
     if out.exists() and not out.is_dir():
         raise MemobenchError(f"--out {out} is a file; name a folder")
     if not out.is_dir() or not any(out.iterdir()):
@@ -290,15 +288,19 @@ def tasks_data(records: Sequence[Record], known: Mapping[str, Task]) -> dict[str
             "memory_type": record["memory_type"],
             "id": libero_id(name),
             "language": task.title if task else name.replace("_", " "),
-            "variants": {str(k): variant_data(task.variant(k)) for k in variants if task and k < task.num_variants},
+            "variants": {
+                str(k): {
+                    "goal": format_formula(one.goal),
+                    "checkpoints": [
+                        {"goal": format_formula(each.goal), "texts": list(each.language)} for each in one.checkpoints
+                    ],
+                }
+                for k in variants
+                if task and k < task.num_variants
+                for one in [task.variant(k)]
+            },
         }
     return result
-
-
-def variant_data(task: Task) -> dict[str, Any]:
-    """Return goal and checkpoints of one variant; texts are coarse, intermediate, fine."""
-    checkpoints = [{"goal": format_formula(each.goal), "texts": list(each.language)} for each in task.checkpoints]
-    return {"goal": format_formula(task.goal), "checkpoints": checkpoints}
 
 
 def evaluation_on_page(

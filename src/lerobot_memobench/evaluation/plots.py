@@ -240,7 +240,6 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
 
 
 def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
-    """Return metric -> its average at each replan interval where it applies."""
     return {
         metric: {
             run.replan_steps: rate
@@ -252,7 +251,6 @@ def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
 
 
 def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) -> None:
-    """Draw rates over a replan interval, or another abscissa."""
     values = [math.nan if rate.value is None else 100 * rate.value for rate in curve.values()]
     intervals = [rate.interval for rate in curve.values() if rate.interval is not None]
     if intervals:

@@ -119,7 +119,13 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
                 name: {"level": level, "own_labels": _percentages(own.average)} for name, (level, own) in levels.items()
             }
     if swept:
-        data["replan_sweep"] = {method: _sweep_data(group) for method, group in swept.items()}
+        data["replan_sweep"] = {
+            method: {
+                "best": {metric: best_interval(group, metric)[0] for metric in group[0].summary.average},
+                "average": {str(run.replan_steps): _percentages(run.summary.average) for run in group},
+            }
+            for method, group in swept.items()
+        }
     return Report(headline(runs), sections, data)
 
 
@@ -180,13 +186,6 @@ def _percentages(row: Row) -> dict[str, float | None]:
 
 def _pooled(rate: Rate) -> dict[str, Any]:
     return {"percent": percent(rate.value), "n": rate.n}
-
-
-def _sweep_data(runs: Sequence[Run]) -> dict[str, Any]:
-    return {
-        "best": {metric: best_interval(runs, metric)[0] for metric in runs[0].summary.average},
-        "average": {str(run.replan_steps): _percentages(run.summary.average) for run in runs},
-    }
 
 
 # --- sentences ---

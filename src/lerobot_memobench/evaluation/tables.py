@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import NamedTuple
 
 from rich import box
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -244,6 +244,15 @@ def to_latex(report: Report) -> str:
 def latex_table(table: Table) -> list[str]:
     """Return the lines of a table in the style of booktabs."""
     columns = "".join("l" if table.is_text(column) else "r" for column in range(len(table.header)))
+    rows = []
+    for index, row in enumerate(table.rows):
+        cells = []
+        for column, cell in enumerate(row):
+            words = table.text(cell, r" {{\scriptsize [{}, {}]}}", latex_text)
+            words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
+            strong = index in table.strong or (index, column) in table.best
+            cells.append(rf"\textbf{{{words}}}" if strong and words else words)
+        rows += [*[r"\midrule"] * (index in table.rules), " & ".join(cells) + r" \\"]
     caption = ". ".join(part.rstrip(".") for part in (table.title, table.note) if part)
     return [
         r"\begin{table}",
@@ -255,7 +264,7 @@ def latex_table(table: Table) -> list[str]:
         *(_latex_groups(table) if table.groups else []),
         " & ".join(latex_text(name) for name in table.header) + r" \\",
         r"\midrule",
-        *(line for index in range(len(table.rows)) for line in _latex_row(table, index)),
+        *rows,
         r"\bottomrule",
         r"\end{tabular}}",
         rf"\caption{{{latex_text(caption)}.}}",
@@ -272,17 +281,6 @@ def _latex_groups(table: Table) -> list[str]:
             rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
         column += span
     return [" & ".join(cells) + r" \\", " ".join(rules)]
-
-
-def _latex_row(table: Table, index: int) -> list[str]:
-    cells = []
-    for column, cell in enumerate(table.rows[index]):
-        words = table.text(cell, r" {{\scriptsize [{}, {}]}}", latex_text)
-        words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
-        strong = index in table.strong or (index, column) in table.best
-        cells.append(rf"\textbf{{{words}}}" if strong and words else words)
-    rule = [r"\midrule"] if index in table.rules else []
-    return [*rule, " & ".join(cells) + r" \\"]
 
 
 # --- the terminal ---
@@ -336,7 +334,6 @@ class Unbroken:
         names.min_width = max(widths, default=1)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render the table as it is where it fits."""
         needed = Measurement.get(PLAIN, PLAIN.options, self.table)
         if needed.minimum <= options.max_width:
             yield self.table
@@ -384,26 +381,21 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
         short = short if len(short) <= 4 else f"{short[:4]}."
         header = f"{short}\n{name}" if title else name
         result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
-    for index in range(len(table.rows)):
+    for index, row in enumerate(table.rows):
         if index in table.rules:
             result.add_section()
-        result.add_row(*_terminal_row(table, index))
+        cells = []
+        for column, cell in enumerate(row):
+            best, whole = (index, column) in table.best, isinstance(cell, Name)
+            style = "bold" if best or index in table.strong else ""
+            overflow: OverflowMethod | None = "ignore" if whole else None
+            cells.append(Text(table.text(cell) + "*" * best, style=style, no_wrap=whole or None, overflow=overflow))
+        result.add_row(*cells)
     if table.best:
         result.caption = "* best of its column"
         result.caption_justify = "left"
     named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
     return result if named is None else Unbroken(result, named)
-
-
-def _terminal_row(table: Table, index: int) -> list[Text]:
-    cells = []
-    for column, cell in enumerate(table.rows[index]):
-        best = (index, column) in table.best
-        style = "bold" if best or index in table.strong else ""
-        whole = isinstance(cell, Name)
-        words = table.text(cell) + "*" * best
-        cells.append(Text(words, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
-    return cells
 
 
 def _in_parts(table: Table) -> list[Table]:
