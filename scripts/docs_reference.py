@@ -1,12 +1,10 @@
 """Generate reference pages and task cards of the site, and adapt links that leave ``docs``: a hook of MkDocs.
 
-The pages are not committed. ``python scripts/docs_reference.py FOLDER`` writes them to a folder. Policy configurations
-are read from their source, without importing torch.
+The pages are not committed. Policy configurations are read from their source, without importing torch.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import html
@@ -61,8 +59,8 @@ PUBLIC = {
     "vla-evaluation-harness": ("vla_eval", "MEMOBench"),
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
-    "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Contrast compare"),
+    "Metrics": ("evaluation.metrics", "Rate Summary summary_of report_values wilson"),
+    "Comparison": ("evaluation.comparison", "Comparison Contrast compare_evaluations"),
     "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
@@ -668,12 +666,14 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Adapt the links of a page that leave ``docs``, and fill in the board (called by MkDocs)."""
     found = relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
     if page.file.src_uri == BOARD_PAGE:
-        board = runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
-        found = found.replace(board["PLACE"], board["table"]())
+        from tools.board.page import PLACE
+        from tools.board.page import table as board_table
+
+        found = found.replace(PLACE, board_table())
     return found
 
 
-def breakable(page: str) -> str:
+def on_page_content(content: str, **_: Any) -> str:
     """Allow line breaks in table cells after ``_``, ``.``, ``/`` and ``=`` of names, and prevent them in intervals."""
 
     def break_cell(match: re.Match[str]) -> str:
@@ -682,23 +682,4 @@ def breakable(page: str) -> str:
         cell = re.sub(r"\[[\d.]+–[\d.]+\]", r'<span class="interval">\g<0></span>', "".join(parts))
         return match[1] + cell + match[3]
 
-    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, page, flags=re.DOTALL)
-
-
-def on_page_content(content: str, **_: Any) -> str:
-    """Let wide tables fit (called by MkDocs)."""
-    return breakable(content)
-
-
-def main() -> None:
-    """Write the generated pages into the given folder."""
-    parser = argparse.ArgumentParser(description="Write the generated pages of the site into a folder.")
-    parser.add_argument("folder", type=Path)
-    out = parser.parse_args().folder
-    for path, make in PAGES.items():
-        (out / path).parent.mkdir(parents=True, exist_ok=True)
-        (out / path).write_text(make())
-
-
-if __name__ == "__main__":
-    main()
+    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, content, flags=re.DOTALL)

@@ -534,7 +534,7 @@ def test_policy_page_lists_all_settings() -> None:
 
 def test_cells_break_within_names_but_not_intervals() -> None:
     page = '<p>a_b</p><td><a href="x_y.html"><code>env.obs_type</code></a> 97.9 [96.9–98.5]</td>'
-    assert reference.breakable(page) == (
+    assert reference.on_page_content(page) == (
         '<p>a_b</p><td><a href="x_y.html"><code>env.<wbr>obs_<wbr>type</code></a> '
         '97.9 <span class="interval">[96.9–98.5]</span></td>'
     )
@@ -550,16 +550,6 @@ def test_links_to_files_outside_the_site_are_adapted() -> None:
     assert (
         reference.relink("[d](docs/develop.md)", "CONTRIBUTING.md", "develop/contributing.md") == "[d](../develop.md)"
     )
-
-
-def test_reference_pages_take_no_option_for_a_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """`--help` prints the usage; it once made a folder of this name, which was committed."""
-    monkeypatch.chdir(tmp_path)
-    for argument in ("--help", "--out"):
-        monkeypatch.setattr(sys, "argv", ["docs_reference.py", argument])
-        with pytest.raises(SystemExit):
-            reference.main()
-    assert not list(tmp_path.iterdir())
 
 
 def test_memory_guides_are_complete() -> None:

@@ -10,7 +10,7 @@ from statistics import mean
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
+from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_run, read_runs
 from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
@@ -183,7 +183,7 @@ def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
-    header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:])
+    header = ("", "training seeds", "SR", "95 %", "of seeds", *PROCESS_METRICS)
     more = ("follows evidence, last seed", "chance", "scenes")
     lines = [_summary_line(row, cells) for row, cells in rows.items()]
     if ceilings:
@@ -212,7 +212,7 @@ def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
         str(len(cells)),
         *_with_interval(average_success(_runs(cells))),
         ", ".join(f"{report['average']['SR']:.0f}" for report in reports),
-        *(_average(reports, metric) for metric in METRICS[1:]),
+        *(_average(reports, metric) for metric in PROCESS_METRICS),
         *columns,
     ]
 
@@ -290,9 +290,9 @@ def _sealed(rows: Rows) -> str:
         if tested := [cell for cell in cells if evaluated(cell, SEALED)]:
             success = average_success(_runs(tested, SEALED))
             reports = [report(cell, SEALED) for cell in tested]
-            averages = [_average(reports, metric) for metric in METRICS[1:]]
+            averages = [_average(reports, metric) for metric in PROCESS_METRICS]
             lines.append([row, str(len(tested)), *_with_interval(success), *averages])
-    return markdown(("", "training seeds", "SR", "95 %", *METRICS[1:]), lines) if lines else ""
+    return markdown(("", "training seeds", "SR", "95 %", *PROCESS_METRICS), lines) if lines else ""
 
 
 def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:

@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
-import random
 import shutil
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -19,7 +14,7 @@ import pytest
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import protocol_of_log, read_run
+from lerobot_memobench.evaluation.records import protocol_of_log
 from lerobot_memobench.jobs.threads import PROCESSES
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
@@ -266,55 +261,6 @@ def test_failed_demonstrations_need_their_dataset(grid: Grid, tmp_path: Path, mo
     makes = True
     data.run()
     assert data.finished()
-
-
-TINY = """
-policy: [policy=memobench_mem, size=small, perception=objects]
-training: [steps=8, save_freq=2]
-evaluation: [split=validation, episodes=2, videos=0, env.horizon=120]
-suites:
-  strict:
-    demonstrations: [--suite, strict, --episodes, "3", --no-images]
-    evaluation: [suite=strict]
-    tasks: [find_the_artichoke_hidden_in_one_of_the_drawers]
-rows:
-  frames: {training: []}
-"""
-
-
-@pytest.mark.slow
-def test_a_study_killed_at_ten_random_moments_has_the_same_results(tmp_path: Path) -> None:
-    (tmp_path / "grid.yaml").write_text(TINY)
-    command = [sys.executable, "-m", "research.memory_study", "--grid", str(tmp_path / "grid.yaml"), "--out"]
-    subprocess.run([*command, str(tmp_path / "whole")], check=True, capture_output=True)
-    rng, killed = random.Random(0), 0
-    while True:
-        study = subprocess.Popen(
-            [*command, str(tmp_path / "killed")], start_new_session=True, stdout=subprocess.DEVNULL
-        )
-        try:
-            study.wait(rng.uniform(4, 40) if killed < 10 else None)
-        except subprocess.TimeoutExpired:
-            os.killpg(study.pid, signal.SIGKILL)
-            study.wait()
-            killed += 1
-            continue
-        break
-    assert study.returncode == 0
-    assert killed >= 5, "the machine was too fast; draw shorter times"
-    whole, other = (
-        Cell(read_grid(tmp_path / "grid.yaml"), tmp_path / name, "strict", "frames", 0) for name in ("whole", "killed")
-    )
-    weights, others = (
-        (cell.policy / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
-        for cell in (whole, other)
-    )
-    assert weights == others
-    outcomes, others = (
-        [{k: v for k, v in one.items() if k not in ("wall_s", "run", "policy")} for one in read_run(folder).records]
-        for folder in (cell.evaluation(ROLLOUTS) for cell in (whole, other))
-    )
-    assert outcomes == others
 
 
 # --- tables ---

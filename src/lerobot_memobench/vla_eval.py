@@ -23,7 +23,7 @@ from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, value_of
+from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, rollout_value
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
@@ -226,9 +226,9 @@ class MEMOBench(StepBenchmark):
         if not step_result.done:
             logger.warning("%s: max_steps ended an episode, which is not logged; set horizon instead", env.task)
         record = env.record()
-        values = {metric: value_of(record, metric) for metric in PROCESS_METRICS}
+        values = {metric: rollout_value(record, metric) for metric in PROCESS_METRICS}
         measured = {metric: value for metric, value in values.items() if value is not None}
-        return {"success": record["success"], **measured, "failure": record["failure"]}
+        return {SUCCESS: record[SUCCESS], **measured, "failure": record["failure"]}
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the metrics that the harness averages over episodes."""

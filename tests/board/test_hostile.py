@@ -19,7 +19,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.board import (
     ABOUT,
-    FILES,
     SALT,
     evaluation,
     first_failure,
@@ -31,7 +30,7 @@ from tests.support.board import (
 )
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_author, check_paths, check_submission, read_board
-from tools.board.rows import board_rows
+from tools.board.page import board_rows
 from tools.board.submission import read_submission
 
 Json = dict[str, Any]
@@ -135,23 +134,16 @@ def relabelled(folder: Path) -> None:
 
 STRICT: dict[str, tuple[Change, str]] = {
     # steps that no execution can have
-    "all solved at once": (every(lambda record: solved(record, 1)), "from step 20 on"),
-    "solved within half a second": (successes(lambda record: solved(record, 10)), "from step 20 on"),
     "one checkpoint at once": (one(lambda record: record["checkpoints"][0].update(first_step=2)), "from step 20 on"),
     "longer than the horizon": (failures(lambda record: record.update(steps=1300)), "at most 1200"),
     "order without checkpoints": (
         one(lambda record: marked(record, firsts(record), [None] * len(record["checkpoints"]))),
         "in order at None",
     ),
-    "order before the checkpoint": (
-        one(lambda record: record["checkpoints"][-1].update(ordered_step=firsts(record)[-1] - 10)),
-        "in order at",
-    ),
     "order after the checkpoint": (
         one(lambda record: record["checkpoints"][0].update(ordered_step=firsts(record)[0] + 10)),
         "in order at",
     ),
-    "order with a gap": (one(lambda record: record["checkpoints"][0].update(ordered_step=None)), "in order at"),
     "order without a first step": (
         in_log(lambda log: first_failure(log)["checkpoints"][0].update(ordered_step=300), card=True),
         "at step None and in order at 300",
@@ -174,7 +166,6 @@ STRICT: dict[str, tuple[Change, str]] = {
     "failures as successes": (failures(lambda record: record.update(success=True, failure=None)), "success"),
     # prompts
     "no prompt": (every(lambda record: record.update(prompt_steps=0)), "begins after 0 steps"),
-    "a longer prompt": (one(lambda record: record.update(prompt_steps=record["prompt_steps"] + 1)), "begins after"),
     "a prompt that was not shown": (
         every(lambda record: record.update(prompt_shown=None)),
         "has prompt_shown=None",
@@ -186,11 +177,6 @@ STRICT: dict[str, tuple[Change, str]] = {
     # scenes
     "scenes of zeros": (every(lambda record: record.update(scene_hash="0" * 16)), "equal for equal seeds only"),
     "no scenes": (every(lambda record: record.pop("scene_hash")), "hashes of 16 digits"),
-    "a scene's name": (one(lambda record: record.update(scene_hash="kitchen")), "hashes of 16 digits"),
-    "two seeds of one scene": (
-        one(lambda record: record.update(scene_hash=scene_of(record["task"], 7)), 3),
-        "equal for equal seeds only",
-    ),
     "other scenes in a control": (
         lambda folder: one(lambda record: record.update(scene_hash="ab" * 8))(folder / "pauses"),
         "equal for equal seeds only",
@@ -200,16 +186,11 @@ STRICT: dict[str, tuple[Change, str]] = {
         "scene_hash_version is 99",
     ),
     # pauses
-    "a control that never paused": (
-        lambda folder: every(lambda record: record.update(paused_steps=0))(folder / "pauses"),
-        r"has \{'paused_steps': 0\}, expected",
-    ),
     "more pauses than steps": (
         lambda folder: one(lambda record: record.update(paused_steps=10**6))(folder / "pauses"),
         r"has \{'paused_steps': 1000000\}, expected",
     ),
     # who acted, on what
-    "privileged state as pixels": (inputs("pixels", obs_type="environment_state_agent_pos"), "inputs are 'pixels'"),
     "a policy of objects as pixels": (features({"observation.environment_state": "ENV"}), "inputs are 'pixels'"),
     "both read, pixels named": (
         both(
@@ -249,10 +230,6 @@ STRICT: dict[str, tuple[Change, str]] = {
         "inputs are 'pixels'",
     ),
     "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
-    "another file of weights": (
-        in_card(lambda card: card["checkpoint"].update(files={**FILES, "model.safetensors": "4" * 64})),
-        "the policy's sha256",
-    ),
     "lines of a similar policy": (every(lambda record: record.update(policy="act_large 0123")), "policy.type: act and"),
     "versions of other years": (
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
@@ -281,9 +258,7 @@ STRICT: dict[str, tuple[Change, str]] = {
     "wide letters": (stating("model", "ｍｅｍｏ"), "one alphabet"),
     "a call of many people": (stating("submitter", "@team @all"), "submitter = "),
     "a date to come": (stating("date", "9999-12-31"), "date = "),
-    "a date before the benchmark": (stating("date", "0001-01-01"), "date = "),
     "a look-alike host": (stating("links", {"code": "https://www.xn--ggle-55da.com/"}), "begins with https"),
-    "a path upwards": (stating("links", {"code": "https://github.com/../x"}), "begins with https"),
 }
 
 
@@ -375,6 +350,7 @@ def test_a_pull_request_changes_one_row_of_its_author(
     stating("submitter", "@other")(shutil.copytree(row, Path("results/board/one")))
     assert check_board([str(board), "changed", "one"]) == 1, "the row belongs to somebody else so far"
     assert "one of @other" in capsys.readouterr().err
+    check_paths(["src/x.py", "results/board/reruns.json"])  # no row
     for paths in (["one/a", "two/a"], ["one/a", "reruns.json"], ["one/a", "../../src/x.py"], ["one/a", "x"]):
         with pytest.raises(MemobenchError, match="the pull request also changes"):
             check_paths(f"results/board/{path}" for path in paths)

@@ -24,7 +24,7 @@ from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.write import UNFINISHED
+from lerobot_memobench.evaluation.html import UNFINISHED
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.run.card import new_card, run_facts, write_card
 from tests.support import logs, synthetic_dataset

@@ -15,9 +15,9 @@ from lerobot_memobench.envs.episode_log import EpisodeRecord, write_episodes
 from lerobot_memobench.envs.settings import SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import STATED
-from lerobot_memobench.evaluation.comparison import compare
+from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.html import write_html
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.evaluation.tables import WRITERS
@@ -88,7 +88,7 @@ def test_missing_episodes_are_named_everywhere(killed: Path, tmp_path: Path) -> 
     assert note in (killed / "report.md").read_text()
     assert json.loads((killed / "report.json").read_text())["missing"] == run.missing
     other = shutil.copytree(killed, tmp_path / "other")
-    compared = compare(*read_runs([killed, other]), permutations=100)
+    compared = compare_evaluations(*read_runs([killed, other]), permutations=100)
     assert [name.split(":")[0] for name in compared.notes if note in name] == ["half", "other"]
     assert note in write_html([killed], tmp_path / "page").page.read_text()
     for words in (["report", killed], ["report", killed, other], ["compare", killed, other]):

@@ -11,11 +11,10 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import Comparison, Contrast, compare, comparison_report
-from lerobot_memobench.evaluation.metrics import METRICS, value_of
+from lerobot_memobench.evaluation.comparison import Comparison, Contrast, compare_evaluations, comparison_report
+from lerobot_memobench.evaluation.metrics import METRICS, rollout_value
 from lerobot_memobench.evaluation.records import read_runs, unlike
-from lerobot_memobench.evaluation.report_tables import AVERAGE
-from lerobot_memobench.evaluation.tables import markdown
+from lerobot_memobench.evaluation.tables import to_markdown
 from tests.support import logs
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
@@ -23,7 +22,7 @@ STOVE = "turn_on_the_stove_and_turn_it_off"
 
 def compared(a: Path, b: Path, **options: Any) -> Comparison:
     first, second = read_runs([a, b])
-    return compare(first, second, **options)
+    return compare_evaluations(first, second, **options)
 
 
 def find(found: Comparison, scope: str, metric: str) -> Contrast:
@@ -44,8 +43,8 @@ def folder(path: Path, reached: list[int], task: str = STOVE, operations: str = 
 def test_counted_by_hand(tmp_path: Path) -> None:
     """Of 8 episodes of each of two tasks, A solves the first 2 and B the first 5."""
     found = compared(logs.evaluation(tmp_path / "a", 2, 8), logs.evaluation(tmp_path / "b", 5, 8))
-    assert (found.pairs, found.notes, found.control) == (16, (), None)
-    average = find(found, AVERAGE, "SR")
+    assert (found.pairs, found.notes, found.control) == (16, [], None)
+    average = find(found, "average of memory types", "SR")
     assert (average.a, average.b, average.only_a, average.only_b) == (0.25, 0.625, 0, 6)
     assert (average.p, average.value) == (2 / 64, 0.375)
     task = find(found, "one", "SR")
@@ -55,8 +54,8 @@ def test_counted_by_hand(tmp_path: Path) -> None:
     assert find(found, "one", "MUR").p == 2 / 8  # three differ, all one way
     assert not [row for row in found.contrasts if (row.scope, row.metric) == ("one", "MCR")]
     report = comparison_report(found)
-    assert f"| {AVERAGE} | SR | 16 | 25.0 | 62.5 | +37.5 | " in markdown(report)
-    assert "| 0 / 6 | 0.031 |" in markdown(report)
+    assert f"| {'average of memory types'} | SR | 16 | 25.0 | 62.5 | +37.5 | " in to_markdown(report)
+    assert "| 0 / 6 | 0.031 |" in to_markdown(report)
     first = json.loads(json.dumps(report.data))["differences"][0]
     assert (first["test"], first["difference"]) == ("mcnemar_exact", 37.5)
 
@@ -75,19 +74,19 @@ def test_rates_are_those_of_the_report(tmp_path: Path) -> None:
                 records.append(logs.rollout(task, memory_type, operations, done, all(done), k))
         write_episodes(tmp_path / name, records)
     a, b = read_runs([tmp_path / "a", tmp_path / "b"])
-    found = compare(a, b)
+    found = compare_evaluations(a, b)
     for metric in METRICS:
-        for scope, rows in ((AVERAGE, "average"), ("temporal", "memory_types")):
+        for scope, rows in (("average of memory types", "average"), ("temporal", "memory_types")):
             row = find(found, scope, metric)
             for run, value in ((a, row.a), (b, row.b)):
                 rates = getattr(run.summary, rows)
-                assert value == (rates[metric] if scope == AVERAGE else rates[scope][metric]).value
+                assert value == (rates[metric] if scope == "average of memory types" else rates[scope][metric]).value
     assert find(found, "stove_transition", "SR").a == find(found, STOVE, "SR").a, "the family has one task here"
 
 
 def test_a_rollouts_share_of_an_operation() -> None:
     record = logs.rollout("t", "temporal", "SSU", [True, False, False], False, 0)
-    assert [value_of(record, metric) for metric in METRICS] == [0.0, 0.5, 0.0, None]
+    assert [rollout_value(record, metric) for metric in METRICS] == [0.0, 0.5, 0.0, None]
 
 
 # --- intervals ---
@@ -187,7 +186,7 @@ def test_two_salts_are_two_draws_of_one_protocol(tmp_path: Path) -> None:
         (tmp_path / name / "protocol.json").write_text(json.dumps(settings))
         both.append(tmp_path / name)
     found = compared(*both)
-    assert (found.pairs, find(found, AVERAGE, "SR").value) == (2, 1.0)
+    assert (found.pairs, find(found, "average of memory types", "SR").value) == (2, 1.0)
     assert [note.partition(":")[0] for note in found.notes] == [
         f"a has the salt {'1' * 32} and b {'2' * 32}",
         *("2 episodes only in a left out", "2 episodes only in b left out"),

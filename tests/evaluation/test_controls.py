@@ -12,7 +12,8 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.controls import gap_closed, with_labels_of
+from lerobot_memobench.evaluation.controls import oracle_share
+from lerobot_memobench.evaluation.report import with_labels_of
 from tests.support.logs import SETTINGS, rollout
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
@@ -119,7 +120,7 @@ def test_recovery_is_the_gain_of_the_prompt_shown_again(tmp_path: Path, capsys: 
     [(0.5, 0.75, 0.5), (0.0, 0.3, 0.3), (0.5, 0.25, -0.5), (1.0, 1.0, None), (0.996, 0.968, None), (None, 0.5, None)],
 )
 def test_share_of_the_gap(first: float | None, second: float, closed: float | None) -> None:
-    assert gap_closed(first, second) == (None if closed is None else pytest.approx(closed))
+    assert oracle_share(first, second) == (None if closed is None else pytest.approx(closed))
 
 
 def test_oracle_memory_closes_a_share_of_the_gap(tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.evaluation.comparison import compare
+from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import evidence_of
-from lerobot_memobench.evaluation.html.data import facts
-from lerobot_memobench.evaluation.metrics import summarise
+from lerobot_memobench.evaluation.html import facts
+from lerobot_memobench.evaluation.metrics import summary_of
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import SETTINGS, rollout
@@ -130,7 +130,7 @@ def test_intervals_of_all_rates_are_over_scenes(tmp_path: Path) -> None:
     """Ten scenes whose three variants end alike are no thirty independent rollouts; the rate itself is the same."""
     plain = [rollout("bowl", "object", "SC", [True, k < 15], k < 15, k) for k in range(30)]
     alike = rollouts("bowl", "object", lambda scene, variant: variant if scene < 5 else None)
-    rate, independent = (summarise(records).average["SR"] for records in (alike, plain))
+    rate, independent = (summary_of(records).average["SR"] for records in (alike, plain))
     assert (rate.value, rate.n, rate.trials, independent.trials) == (0.5, 30, 10, 30)
     widths = []
     for records in (alike, plain):
@@ -138,7 +138,7 @@ def test_intervals_of_all_rates_are_over_scenes(tmp_path: Path) -> None:
         for name, lines in (("a", none), ("b", records)):
             write_episodes(tmp_path / f"{name}{len(widths)}", lines)
         first, second = read_runs([tmp_path / f"{name}{len(widths)}" for name in "ab"])
-        low, high = compare(first, second, permutations=10).contrasts[0].interval
+        low, high = compare_evaluations(first, second, permutations=10).contrasts[0].interval
         widths.append(high - low)
     assert widths[0] > 1.4 * widths[1], "by about the square root of three"
 

@@ -20,8 +20,15 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.data import page_data, task_source
-from lerobot_memobench.evaluation.html.write import find_videos, frame_count, inline_json, page, write_html
+from lerobot_memobench.evaluation.html import (
+    find_videos,
+    frame_count,
+    inline_json,
+    page,
+    page_data,
+    task_source,
+    write_html,
+)
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs

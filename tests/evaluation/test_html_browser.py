@@ -19,7 +19,7 @@ import pytest
 
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import VideoRecorder
-from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.html import write_html
 from lerobot_memobench.policies.memory_reads import reads_file, write_reads
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium

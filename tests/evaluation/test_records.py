@@ -12,13 +12,12 @@ import pytest
 from lerobot_memobench.envs.episode_log import EpisodeLog, differences, with_omitted, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_protocol
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import compare
+from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.html.write import write_html
-from lerobot_memobench.evaluation.metrics import failure_counts, summarise
+from lerobot_memobench.evaluation.html import write_html
+from lerobot_memobench.evaluation.metrics import failure_counts, summary_of
 from lerobot_memobench.evaluation.records import read_protocol, read_run, read_runs, sweeps
-from lerobot_memobench.evaluation.report import build, write_report
-from lerobot_memobench.evaluation.report_tables import failures_table
+from lerobot_memobench.evaluation.report import evaluation_report, failures_table, write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.run.shards import merge
 from lerobot_memobench.tasks.failures import FAILURES
@@ -138,7 +137,7 @@ def test_other_settings_are_noted_in_every_format(tmp_path: Path) -> None:
         write_protocol(folder, {**settings, **changes})
     found = [f"{tmp_path}/{name}" for name in "abc"]
     words = "(horizon: 1200 and 600; inputs: pixels and privileged object state"
-    report = build(read_runs(found))
+    report = evaluation_report(read_runs(found))
     for name in ("markdown", "table", "latex", "json"):
         text = " ".join(WRITERS[name](report).split()).replace("\\_", "_")
         assert f"a and b have different protocols {words}" in text, name
@@ -156,9 +155,9 @@ def test_suites_and_worlds_are_not_mixed(tmp_path: Path, key: str, value: str) -
     with pytest.raises(MemobenchError, match=f"{key}="):
         write_html([other, plain], tmp_path / "page")
     with pytest.raises(MemobenchError, match=f"{key}: "):
-        compare(*read_runs([plain]), *read_runs([other]))
+        compare_evaluations(*read_runs([plain]), *read_runs([other]))
     with pytest.raises(MemobenchError, match=f"--allow '{key}'"):
-        compare(*read_runs([plain]), *read_runs([other]), allow=[key])
+        compare_evaluations(*read_runs([plain]), *read_runs([other]), allow=[key])
     with pytest.raises(MemobenchError, match=rf"\({key}: "):
         merge(tmp_path / "joined", [plain, other])
     usual = {"suite": "published", "world": "libero"}[key]
@@ -183,8 +182,8 @@ def test_failures_of_strict_tasks_follow_the_published_ones() -> None:
     assert list(failure_counts(plain)) == list(FAILURES)
     counted = failure_counts([*plain, failed("miscount", 1), failed("miscount", 2), failed("wrong_place", 3)])
     assert counted == {**failure_counts(plain), "miscount": 2, "wrong_place": 1}
-    published = failures_table(summarise(plain))
-    table = failures_table(summarise([*plain, failed("miscount", 1)]))
+    published = failures_table(summary_of(plain))
+    table = failures_table(summary_of([*plain, failed("miscount", 1)]))
     assert [row[0] for row in table.rows] == [*(row[0] for row in published.rows), "miscount"]
     assert "Miscount" in str(table.note)
     assert "Miscount" not in str(published.note)

@@ -26,8 +26,7 @@ from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import Rate, report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, line_style
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.evaluation.report import build, write_report
-from lerobot_memobench.evaluation.report_tables import best_interval
+from lerobot_memobench.evaluation.report import best_interval, evaluation_report, write_report
 from lerobot_memobench.evaluation.tables import (
     WIDTH,
     WRITERS,
@@ -38,7 +37,7 @@ from lerobot_memobench.evaluation.tables import (
     best_in_columns,
     csv_tables,
     csv_text,
-    markdown,
+    to_markdown,
 )
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
@@ -132,7 +131,7 @@ STRICT = "strict suite, referent fixed, seeds 7 to 8, 2 episodes of first, repla
 def test_first_line(tmp_path: Path) -> None:
     run = write_report(prompted(tmp_path / "a", {"type": "act"}, {"path": "user/mine"}))
     assert headline([run]) == f"act (user/mine): {STRICT}; inputs: pixels, prompt in steps (observed)"
-    found = build([run])
+    found = evaluation_report([run])
     assert WRITERS["markdown"](found).splitlines()[0] == f"# {headline([run])}"
     assert " ".join(WRITERS["table"](found).split()).startswith(headline([run]))
     assert WRITERS["latex"](found).startswith(f"% {headline([run])}")
@@ -168,13 +167,13 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
 
 def test_json(sweep: list[Run], tmp_path: Path) -> None:
     runs = read_runs([logs.evaluation(tmp_path / "a")])
-    data = json.loads(WRITERS["json"](build(runs)))
+    data = json.loads(WRITERS["json"](evaluation_report(runs)))
     schema = json.loads(json.dumps(report_values(runs[0].summary)))
     assert {key: data[key] for key in schema} == schema
     assert data["intervals"]["average"]["SR"] == [21.5, 78.5]  # 4 of 8
     assert data["ordered_prefix"] == schema["prefix"]
     assert data["pooled"]["checkpoints"] == {"percent": 80.0, "n": 20}
-    swept = json.loads(WRITERS["json"](build(sweep)))["replan_sweep"]["mine_&_co"]
+    swept = json.loads(WRITERS["json"](evaluation_report(sweep)))["replan_sweep"]["mine_&_co"]
     assert swept["average"]["20"] == {"SR": 75.0, "MSR": 100.0, "MUR": 87.5, "MCR": 75.0}
     assert swept["best"] == {"SR": [20], "MSR": [5, 20, 35], "MUR": [20], "MCR": [20]}
     assert best_interval(sweep, "SR")[0] == [20]
@@ -185,7 +184,7 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
         [{"name": "=cmd()", "figure": -3.5, "rest": None}, {"name": "@SUM(1)", "figure": "a, b", "rest": "-"}]
     )
     assert list(csv.reader(io.StringIO(text)))[1:] == [["'=cmd()", "-3.5", ""], ["'@SUM(1)", "a, b", "'-"]]
-    found = build(sweep)
+    found = evaluation_report(sweep)
     rows = list(csv.DictReader(io.StringIO(csv_tables(found)["joined"])))
     (row,) = [row for row in rows if row["task"] == "one"]
     name = "mine_&_co k=20"
@@ -193,7 +192,9 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert row[f"MCR {name}"] == ""
     assert [row["task"] for row in rows] == ["one", "temporal", "two_of_them", "spatial", "average of memory types"]
     (alone,) = [
-        row for row in csv.DictReader(io.StringIO(csv_tables(build(sweep[:1]))["tasks"])) if row["task"] == "one"
+        row
+        for row in csv.DictReader(io.StringIO(csv_tables(evaluation_report(sweep[:1]))["tasks"]))
+        if row["task"] == "one"
     ]
     assert alone["n"] == "4"
     words = [f"mine={run.folder}" for run in sweep]
@@ -201,7 +202,7 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert main(["report", *words, *formats, "--out", str(tmp_path / "out")]) == 0
     written = {str(path.relative_to(tmp_path / "out")) for path in (tmp_path / "out").rglob("*") if path.is_file()}
     files = {"report.json", "report.tex", "report.md", "report.txt"}
-    tables = build(read_runs(words)).tables
+    tables = evaluation_report(read_runs(words)).tables
     assert written == files | {f"tables/{table.key}.csv" for table in tables}
     capsys.readouterr()
     (tmp_path / "file").write_text("")
@@ -209,7 +210,7 @@ def test_csv(sweep: list[Run], tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_latex_is_balanced_and_escaped(sweep: list[Run]) -> None:
-    text = WRITERS["latex"](build(sweep))
+    text = WRITERS["latex"](evaluation_report(sweep))
     assert r"mine\_\&\_co k=20" in text
     assert r"\texttt{two\_of\_them}" in text
     assert text.count("{") == text.count("}")
@@ -233,7 +234,7 @@ def test_markdown_escapes_all_text() -> None:
     """By a CommonMark parser with tables: every block and mark is the report's own."""
     table = Table("t", EVIL, (EVIL, "b"), ((EVIL, "1"), (Name(EVIL), "2")), note=f"# {EVIL}")
     report = Report(EVIL, (Section(EVIL, (table,), (f"- {EVIL}", f"12. {EVIL}", "==="), (f"> {EVIL}",)),))
-    tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(markdown(report))
+    tokens = MarkdownIt("commonmark").enable(["table", "strikethrough"]).parse(to_markdown(report))
     blocks = {token.type for token in tokens if token.nesting != 0}
     assert blocks <= {f"{name}_{end}" for name in BLOCKS for end in ("open", "close")}
     assert [token.type for token in tokens].count("tr_open") == 3
@@ -247,7 +248,7 @@ def test_terminal_tables(sweep: list[Run]) -> None:
         Table("t", "", ("a", "b"), (("x",),))
     rows = (("x", Rate(0.5, 4), Rate(None, 0)), ("y", Rate(0.5, 8), Rate(0.1, 4)))
     assert best_in_columns(rows) == {(0, 1), (1, 1), (1, 2)}
-    text = WRITERS["table"](build(sweep))
+    text = WRITERS["table"](evaluation_report(sweep))
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text
 

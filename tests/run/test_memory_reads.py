@@ -15,8 +15,7 @@ from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import OBJECTS, RESET, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.data import page_data
-from lerobot_memobench.evaluation.html.write import write_html
+from lerobot_memobench.evaluation.html import page_data, write_html
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.memory_reads import (
     Chunk,

@@ -264,7 +264,7 @@ def test_unneeded_pictures_are_not_drawn(use_async: bool, tmp_path: Path) -> Non
 def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
     """One of two episodes is recorded; of the other the needed pictures are drawn."""
     from lerobot_memobench.envs.video import LAST_FRAMES
-    from lerobot_memobench.evaluation.html.write import frame_count
+    from lerobot_memobench.evaluation.html import frame_count
 
     words = [f"tasks={HIGHLIGHT}", "episodes=2", "batch_size=1", f"horizon={HORIZON}", "videos=1"]
     assert main(["eval", "env=memobench", *words, f"output_dir={tmp_path}"]) == 0

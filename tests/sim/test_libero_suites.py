@@ -1,8 +1,7 @@
 """Scenes of LIBERO's suites equal those of stock LIBERO.
 
-`suites.npz` is a part of the records that `scripts/libero_suite_records.py` makes with hf-libero 0.1.4 and MuJoCo
-3.3.7: for 25 tasks, which have all predicates of LIBERO's goals, the state after the reset to episode 0 (seed 7) and
-the goal's atoms in 25 other states.
+`suites.npz` holds records of hf-libero 0.1.4 with MuJoCo 3.3.7: for 25 tasks, which have all predicates of LIBERO's
+goals, the state after the reset to episode 0 (seed 7) and the goal's atoms in 25 other states.
 """
 
 from __future__ import annotations
@@ -17,8 +16,7 @@ from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks
-from tests.support.libero import record, recorded_answers
-from tests.support.scripts import load_script
+from tests.support.libero import mujocos, record, recorded_answers, whole_model
 
 RECORDED = "3.3.7"
 """MuJoCo's version in the records."""
@@ -119,8 +117,8 @@ def test_all_scenes_compile_with_the_width_of_their_states(suite: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ONE_OF_EACH_ARENA.values())
 def test_images_equal_mujocos_renderer(name: str, mujoco_renderer: type[mujoco.Renderer]) -> None:
-    looks, sim = load_script("libero_looks"), start(name)
-    theirs = looks.mujocos(sim, looks.whole_model(sim), 0)
+    sim = start(name)
+    theirs = mujocos(sim, whole_model(sim), 0)
     for camera, image in zip(MJCF_CAMERAS, theirs, strict=True):
         error = np.abs(sim.render(camera).astype(int) - image).mean()
         assert error <= 3.0, f"{camera}: {error:.2f}"

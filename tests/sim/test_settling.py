@@ -13,7 +13,7 @@ from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.evaluation.metrics import notes_on
 from lerobot_memobench.protocol import PAPER, PUBLISHED_MUJOCO, SPLITS
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from tests.support.scripts import load_script
+from tests.support.libero import simulate
 
 PAGE = Path(__file__).parents[2] / "results" / "unsettled_scenes.md"
 LISTED = {
@@ -21,6 +21,16 @@ LISTED = {
     for name, seeds in re.findall(r"^\| `(.+?)` \|.*\| ([\d, ]+) \|$", PAGE.read_text(), re.MULTILINE)
 }
 SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
+
+
+def unsettled(name: str, seeds: range | list[int]) -> list[int]:
+    """Return the seeds of a task whose scenes do not settle."""
+    sim, found = simulate(name), []
+    for seed in seeds:
+        sim.reset(seed)
+        if not sim.settled:
+            found.append(seed)
+    return found
 
 
 def test_list_is_of_published_tasks_and_the_papers_seeds() -> None:
@@ -33,7 +43,7 @@ def test_list_is_of_published_tasks_and_the_papers_seeds() -> None:
 @pytest.mark.parametrize("name", [SWAP, "put_the_milk_picked_up_in_the_prompt_video_on_the_plate"])
 def test_listed_scenes_are_those_that_do_not_settle(name: str) -> None:
     seeds = [7, 8, 22, 28, 29]
-    assert load_script("unsettled_scenes").unsettled(name, seeds) == [s for s in seeds if s in LISTED.get(name, [])]
+    assert unsettled(name, seeds) == [s for s in seeds if s in LISTED.get(name, [])]
 
 
 @pytest.mark.slow
@@ -41,7 +51,7 @@ def test_listed_scenes_are_those_that_do_not_settle(name: str) -> None:
 @pytest.mark.parametrize("name", task_names(suite=None))
 def test_all_listed_scenes(name: str) -> None:
     """Of strict tasks there are none: such scenes are drawn again."""
-    assert load_script("unsettled_scenes").unsettled(name, SPLITS[PAPER]) == LISTED.get(name, [])
+    assert unsettled(name, SPLITS[PAPER]) == LISTED.get(name, [])
 
 
 def test_report_counts_them() -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.board.rules import FEWEST, MOST, check_control, check_evaluation
+from lerobot_memobench.board.rules import FEWEST, check_control, check_evaluation
 from lerobot_memobench.envs.episode_log import INPUTS, OF_ONE_EVALUATION, POLICY, differences, evidence_line
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
 from lerobot_memobench.envs.pacing import paused
@@ -151,7 +151,6 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 
 
 def _check_log(run: Submitted) -> None:
-    """Check that settings and outcomes in the log are those of one evaluation that can have taken place."""
     _check_inputs(run)
     _check_policy(run)
     check_lines(run.place, {**run.card, "protocol": run.protocol}, run.records)
@@ -233,7 +232,6 @@ def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
 
 
 def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
-    """Check that a line has the fields of its control and no others, with the catalogue's variants and chance."""
     steps = record.get("paused_steps")
     possible = paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
     expected: dict[str, Any] = {"paused_steps": steps if steps in possible else possible} if possible else {}
@@ -269,7 +267,6 @@ def _check_inputs(run: Submitted) -> None:
 
 
 def _ignores_objects(kind: str) -> bool:
-    """Return whether a policy type is one of LeRobot's that do not read objects."""
     import lerobot.policies  # noqa: F401 - registers the types
     from lerobot.configs.policies import PreTrainedConfig
 
@@ -282,7 +279,6 @@ def _block(value: Any) -> Mapping[str, Any]:
 
 
 def _check_policy(run: Submitted) -> None:
-    """Check that the hash of a checkpoint is that of its files on the card."""
     there, checkpoint = run.card[POLICY].get("sha256"), run.card["checkpoint"] or {}
     if there != (tree_hash(checkpoint["files"]) if checkpoint.get("files") else None):
         raise MemobenchError(
@@ -322,7 +318,6 @@ def _check_scenes(runs: Sequence[Submitted]) -> None:
 
 
 def _check_original(submission: Submission, other: Submission) -> None:
-    """Check that a row does not repeat another row."""
     mine, theirs = submission.evaluation, other.evaluation
     if mine.digest == theirs.digest or _copied(mine.records, theirs.records) > COPIED:
         raise MemobenchError(
@@ -350,7 +345,6 @@ def _copied(mine: Sequence[Mapping[str, Any]], theirs: Sequence[Mapping[str, Any
 
 
 def _drawn(record: Mapping[str, Any]) -> tuple[str, int, int]:
-    """Return the scene and the variant of a rollout."""
     return record["task"], record["seed"], record["variant"]
 
 
@@ -360,15 +354,9 @@ def _reached(record: Mapping[str, Any]) -> list[int]:
 
 
 def ranked(run: Submitted) -> bool:
-    """Return whether an evaluation enters the ranking: strict suite, each scene with each variant, all scenes."""
-    return run.protocol["suite"] == STRICT and is_complete(run.protocol)
-
-
-def is_complete(protocol: Mapping[str, Any]) -> bool:
-    """Return whether a protocol has the episodes of a complete evaluation; of the strict suite one with evidence.
+    """Return whether an evaluation enters the ranking: strict suite, each scene with each variant, all scenes.
 
     Without evidence a table from first observations to answers would be right: both follow from public seeds.
     """
-    if protocol["suite"] == STRICT or protocol["evidence"]:
-        return bool(protocol["evidence"] and protocol["episodes"] == EVIDENCE_EPISODES)
-    return bool(protocol["episodes"] == MOST)
+    protocol = run.protocol
+    return protocol["suite"] == STRICT and protocol["evidence"] and protocol["episodes"] == EVIDENCE_EPISODES

@@ -89,7 +89,6 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _check_entries(folder: Path, folders: Sequence[str]) -> None:
-    """Refuse unknown names, links, missing and large files."""
     if not stat.S_ISDIR(folder.lstat().st_mode):
         raise MemobenchError(f"{folder} is not a folder; expected one with {CARD} and {LOG}")
     entries = sorted(folder.iterdir())

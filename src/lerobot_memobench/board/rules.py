@@ -75,7 +75,6 @@ def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool
 
 
 def _check_settings(run: Evaluation, **control: Any) -> None:
-    """Check that the settings are those of the board, and of a control."""
     protocol = run.protocol
     if protocol["suite"] not in (PUBLISHED, STRICT):
         raise MemobenchError(
@@ -121,7 +120,6 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
 
 
 def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
-    """Check that one version ran all parts, with the task files of this version."""
     for package in PACKAGES[:3]:
         versions = {start["versions"].get(package) for start in run.card["runs"]}
         if len(versions) > 1:
@@ -148,7 +146,6 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
 
 
 def _check_salt(run: Evaluation) -> None:
-    """Check that an evaluation on the sealed seeds, and no other, has a salt."""
     if (SEEDS[run.protocol["seed_base"]] == SEALED) != bool(run.protocol["salt"]):
         raise MemobenchError(
             f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "

@@ -1,4 +1,4 @@
-"""Files of a submission: the statements of the submitter, reading an evaluation, and writing.
+"""Files of a submission, and the text of its pull request.
 
 A row of the board is a folder with the card and the log of an evaluation. The card has a ``submission`` block in
 addition. Subfolders hold the evaluations of controls.
@@ -25,6 +25,7 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, read_log, wi
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, requested_lines
+from lerobot_memobench.evaluation.report import evaluation_markdown
 from lerobot_memobench.io import PACKED, refuse_links, write_file
 from lerobot_memobench.run.card import write_card
 
@@ -186,3 +187,36 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
             file.write("".join(lines).encode())
         write_file(place / LOG, packed.getvalue())
     return folder
+
+
+# --- the text of a pull request ---
+
+PROMISES = (
+    "No setting of this policy was chosen on the seeds of this evaluation.",
+    "No demonstration of these seeds was used in training.",
+    "The maintainers may rerun it: weights or a policy server are available at the links, or on request.",
+)
+"""Statements of a submitter that no program can check; template and form ask for the same."""
+
+
+def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
+    """Return the text in Markdown: files, statements of the submitter, promises to confirm, report of the evaluation.
+
+    Args:
+        name: of the row's folder.
+    """
+    stated = about.model_dump(exclude_none=True)
+    stated |= stated.pop("links")
+    lines = [
+        f"This pull request adds `results/board/{name}` and changes nothing else: `{CARD}`, `{LOG}` and, for a "
+        f"control, the same two files in {' and '.join(f'`{control}`' for control in CONTROLS)}.",
+        "",
+        "| | |",
+        "|---|---|",
+        *(f"| {key.replace('_', ' ')} | {value} |" for key, value in stated.items()),
+        "",
+        *(f"- [ ] {promise}" for promise in PROMISES),
+        "",
+        evaluation_markdown(evaluation.run),
+    ]
+    return "\n".join(lines)

@@ -151,7 +151,7 @@ def evaluate_suites(suites: Sequence[str], words: Mapping[str, str]) -> int:
     """Run an evaluation of each of several suites of LIBERO, in a folder of its name; return the highest status."""
     from lerobot_memobench.envs.episode_log import has_log
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report_tables import memory_types_table
+    from lerobot_memobench.evaluation.report import memory_types_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
     named = words.get("output_dir")
@@ -238,8 +238,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
     from lerobot_memobench.evaluation.headline import headline
-    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
-    from lerobot_memobench.evaluation.report_tables import failure_line, rates_table
+    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, failure_line, rates_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
     screen = console()

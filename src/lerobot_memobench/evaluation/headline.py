@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from lerobot_memobench.envs.episode_log import OMITTED, POLICY
 from lerobot_memobench.envs.settings import MEMORY_CONTROLS, PICTURES
-from lerobot_memobench.evaluation.metrics import Record, policy_inputs, stand_ins_of
+from lerobot_memobench.evaluation.metrics import Record, inputs_phrase, stand_ins_of
 from lerobot_memobench.evaluation.records import Run, of_all
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
@@ -70,7 +70,6 @@ def protocol_phrases(run: Run) -> list[str]:
 
 
 def _seeds(run: Run) -> list[str]:
-    """Return the seeds, and the split that they are of where it is not the paper's."""
     logged = {record["seed"] for record in run.records if record.get("seed") is not None}
     if not logged:
         return []
@@ -92,7 +91,7 @@ def extent_phrase(records: Sequence[Record]) -> str:
 
 def inputs_of(run: Run) -> str:
     """Return the policy's inputs and, where there was a demonstration prompt, whether the policy observed it."""
-    inputs, prompt_in = f"inputs: {policy_inputs(run.records)}", run.protocol.get("prompt_in")
+    inputs, prompt_in = f"inputs: {inputs_phrase(run.records)}", run.protocol.get("prompt_in")
     if run.protocol.get("demonstration_prompt") is False:
         return f"{inputs}, no demonstration prompt"
     prompted = any(each.get("prompt_steps") and each.get("prompt_shown", True) is not None for each in run.records)

@@ -33,7 +33,7 @@ from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES, SETTINGS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import check_lines, disagreements, extent_of
 from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
-from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summarise
+from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summary_of
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 from lerobot_memobench.tasks.catalogue import GROUPS
@@ -138,7 +138,7 @@ class Run:
     @cached_property
     def summary(self) -> Summary:
         """Every figure of its rollouts."""
-        return summarise(self.records)
+        return summary_of(self.records)
 
     @cached_property
     def evidence(self) -> EvidenceRates | None:

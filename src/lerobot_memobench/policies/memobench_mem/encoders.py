@@ -170,7 +170,7 @@ class ImageTowerEncoder(ObservationEncoder):
         """Return the tower's pictures of all cameras; black ones, masked, for cameras that the batch lacks."""
         pictures = [self._resized(batch[camera]) for camera in self.cameras if camera in batch]
         if not pictures:
-            raise MemobenchError(f"The observation has no picture; {cure('picture', batch)}")
+            raise MemobenchError(f"The observation has no picture; {hint('picture', batch)}")
         missing = len(self.cameras) - len(pictures)
         rows, blank = len(pictures[0]), torch.full_like(pictures[0], -1.0)
         masks = [torch.full((rows,), real) for real in [True] * len(pictures) + [False] * missing]
