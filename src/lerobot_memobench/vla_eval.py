@@ -228,7 +228,7 @@ class MEMOBench(StepBenchmark):
         record = env.record()
         values = {metric: rollout_value(record, metric) for metric in PROCESS_METRICS}
         measured = {metric: value for metric, value in values.items() if value is not None}
-        return {SUCCESS: record[SUCCESS], **measured, "failure": record["failure"]}
+        return {"success": record["success"], **measured, "failure": record["failure"]}
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the metrics that the harness averages over episodes."""

@@ -95,10 +95,10 @@ def generate(
         )
     rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
     for name in summary.tasks:
-        episodes = [episode for episode in summary.episodes if episode.task_name == name]
-        frames = [episode.frames for episode in episodes if episode.failure is None]
+        of_task = [episode for episode in summary.episodes if episode.task_name == name]
+        frames = [episode.frames for episode in of_task if episode.failure is None]
         mean = f"{sum(frames) / len(frames):.0f}" if frames else "–"
-        rows.add_row(name, str(len(frames)), str(len(episodes)), str(sum(frames)), mean)
+        rows.add_row(name, str(len(frames)), str(len(of_task)), str(sum(frames)), mean)
     console().print(Unbroken(rows), crop=False)
     for episode in summary.failures:
         say(f"no demonstration of {episode.task_name}, seed {episode.seed}: {episode.failure}")
