@@ -161,7 +161,7 @@ def test_chunks_end_at_a_hold(perception: str, tmp_path: Path) -> None:
     if lookup.columns:
         actions = lookup.columns["action"].numpy()[ACTS]
         np.testing.assert_allclose(
-            execution_statistics(training.policy.config, training.dataset.meta, lookup)["action"]["mean"],
+            execution_statistics(lookup)["action"]["mean"],
             actions.mean(axis=0),
             atol=1e-6,
         )
