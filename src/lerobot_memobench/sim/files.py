@@ -106,14 +106,7 @@ def unused(found: Iterable[Place]) -> str:
 
 
 def asset(name: str) -> Path:
-    """Return the path of a verified LIBERO file.
-
-    Args:
-        name: path below the assets folder, one of `known_hashes`.
-
-    Raises:
-        MemobenchError: as `check_assets`.
-    """
+    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `check_assets`."""
     return _verified(check_assets())[name]
 
 

@@ -146,7 +146,7 @@ def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None
         raise MemobenchError(f"{path} contains no body 'object'; expected an object file of LIBERO")
     place = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
     return ClassFile(
-        body=_with_defaults_resolved(body, _defaults(root)),
+        body=_resolved(body, root),
         assets=lambda: list(_assets(root, _inside(path))) if folder is None else assets_of(root, folder),
         radius=place["horizontal_radius_site"][0],
         bottom=place["bottom_site"][2],
@@ -172,23 +172,19 @@ def _scanned_class(path: Path) -> ClassFile:
     """Read a scan; its size is computed from vertices because it has no sites."""
     root = _read(path)
     body = root.find("worldbody/body")
-    points = [line.split()[1:4] for file in sorted(path.parent.glob("visuals/*.obj")) for line in _vertex_lines(file)]
+    lines = (line for file in sorted(path.parent.glob("visuals/*.obj")) for line in file.read_text().splitlines())
+    points = [line.split()[1:4] for line in lines if line.startswith("v ")]
     if body is None or not points:
         raise MemobenchError(f"the scan {path} lacks its body or its visuals/*.obj; download the scans again")
     vertices = np.array(points, dtype=np.float64)
-
     return ClassFile(
-        body=_with_defaults_resolved(body, _defaults(root)),
+        body=_resolved(body, root),
         assets=lambda: list(_assets(root, _inside(path))),
         radius=float(np.abs(vertices[:, :2]).max()),
         bottom=float(vertices[:, 2].min()),
         top=float(vertices[:, 2].max()),
         turns=SCAN_TURNS,
     )
-
-
-def _vertex_lines(file: Path) -> Iterator[str]:
-    return (line for line in file.read_text().splitlines() if line.startswith("v "))
 
 
 # --- MJCF ---
@@ -216,18 +212,14 @@ def format_numbers(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _defaults(root: ET.Element) -> dict[tuple[str, str], dict[str, str]]:
-    """Return class and tag -> attributes."""
-    return {
-        (default.get("class", ""), element.tag): dict(element.attrib)
+def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
+    """Return a copy of a body with the file's default classes resolved."""
+    defaults = {
+        (default.get("class", ""), element.tag): element.attrib
         for default in root.iter("default")
         for element in default
         if element.tag != "default"
     }
-
-
-def _with_defaults_resolved(body: ET.Element, defaults: dict[tuple[str, str], dict[str, str]]) -> ET.Element:
-    """Return a copy of a body with default classes resolved."""
     body = copy.deepcopy(body)
     for element in body.iter():
         named = element.attrib.pop("class", None)

@@ -39,7 +39,6 @@ from lerobot_memobench.sim.asset import (
 from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, UNKNOWN_CLASS, Arena, arena_of
 from lerobot_memobench.sim.files import user_folders
 from lerobot_memobench.sim.visuals import drawing_model
-from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.task import STRICT, Task
 from mujoco_raster.drawlist import DrawList
 
@@ -149,12 +148,7 @@ def instances(task: Task) -> Iterator[tuple[str, str]]:
 
 
 def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
-    """Return a task's scene as an editable specification.
-
-    Args:
-        task: task of the scene.
-        visuals: whether to include visual geoms, materials and lights.
-    """
+    """Return a task's scene as an editable specification, with or without visual geoms, materials and lights."""
     spec = mujoco.MjSpec.from_string(scene_xml(task, visuals))
     spec.modelname = "libero"
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
@@ -209,8 +203,7 @@ def scene_xml(task: Task, visuals: bool) -> str:
 
 def _place_arm(world: ET.Element, arena: Arena) -> None:
     """Move the arm to its place in an arena, and remove its mount in arenas without one."""
-    base = next(body for body in world.iter("body") if body.get("name") == "robot0_base")
-    mount = next(body for body in base.iter("body") if body.get("name") == "mount0_base")
+    base, mount = _body(world, "robot0_base"), _body(world, "mount0_base")
     x, y, z = arena.base
     if arena.mounted:
         z = mjcf.parse_numbers(base.attrib["pos"])[2]
@@ -218,6 +211,10 @@ def _place_arm(world: ET.Element, arena: Arena) -> None:
         mount.clear()
         mount.attrib.update(name="mount0_base", pos="0 0 0")
     base.set("pos", mjcf.format_numbers((x, y, z)))
+
+
+def _body(root: ET.Element, name: str) -> ET.Element:
+    return next(body for body in root.iter("body") if body.get("name") == name)
 
 
 def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
@@ -255,18 +252,13 @@ def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> 
 
 def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
     """Yield the sites of the table's regions, one for the first range of each."""
+    x, y, z = arena.zones
     for name, region in task.regions.items():
         if task.fixtures.get(region.target) in ARENAS and region.ranges:
-            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(arena, region)})
-
-
-def _zone(arena: Arena, region: Region) -> dict[str, str]:
-    x1, y1, x2, y2 = region.ranges[0]
-    x, y, z = arena.zones
-    return {
-        "pos": mjcf.format_numbers(((x2 + x1) / 2 + x, (y2 + y1) / 2 + y, z)),
-        "size": mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
-    }
+            x1, y1, x2, y2 = region.ranges[0]
+            pos = mjcf.format_numbers(((x2 + x1) / 2 + x, (y2 + y1) / 2 + y, z))
+            size = mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT))
+            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), "pos": pos, "size": size})
 
 
 def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
@@ -283,15 +275,10 @@ def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
 
 def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
     """Add an invisible site at the centre of each handle, for experts."""
-    for _, part in _parts(class_name):
-        moving = next(one for one in body.iter("body") if one.get("name") == f"{name}_{part.body}")
+    for _, part in ALL_CLASSES.get(class_name, UNKNOWN_CLASS).parts:
         pose = {"pos": mjcf.format_numbers(part.handle), "quat": mjcf.format_numbers(part.handle_quaternion)}
         site = {"name": f"{name}_{part.handle_site}", "group": str(SITE_GROUP), **pose, "size": "0.005"}
-        moving.append(ET.Element("site", site))
-
-
-def _parts(class_name: str) -> tuple[tuple[str, Articulation], ...]:
-    return ALL_CLASSES.get(class_name, UNKNOWN_CLASS).parts
+        _body(body, f"{name}_{part.body}").append(ET.Element("site", site))
 
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
@@ -324,7 +311,6 @@ def standing_heights() -> dict[str, float]:
 
 
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
-    """Return the facts about an instance."""
     known = ALL_CLASSES.get(class_name, UNKNOWN_CLASS)
     upright = Y_UP if known.y_up else None
     root = model.body(name).id
@@ -379,12 +365,8 @@ def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tup
             half = np.abs(turn) @ model.geom_aabb[geom][3:]
             corners.append((middle - half, middle + half))
     lows, highs = zip(*corners, strict=True)
-    return _triple(np.min(lows, axis=0)), _triple(np.max(highs, axis=0))
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    (x1, y1, z1), (x2, y2, z2) = np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()
+    return (x1, y1, z1), (x2, y2, z2)
 
 
 # --- detents ---
