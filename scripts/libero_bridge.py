@@ -30,7 +30,7 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE, has_log, read_log
 from lerobot_memobench.evaluation.statistics import mcnemar
 from lerobot_memobench.policies.remote.transports import Websocket
 from lerobot_memobench.protocol import EVALUATION_SEED, UPSTREAM, UPSTREAM_EVALUATIONS, UPSTREAM_HORIZON
-from lerobot_memobench.sim.classes import CLASSES
+from lerobot_memobench.sim.asset import CLASSES
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.progress import Progress

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.classes import ARENAS, arena_of
+from lerobot_memobench.sim.asset import ARENAS, arena_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.robot import SUBSTEPS
 from lerobot_memobench.sim.scene import get_scene

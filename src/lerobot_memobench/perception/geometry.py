@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.classes import AGENTVIEW_ANGLE, AGENTVIEW_POSITION, AGENTVIEW_QUATERNION
+from lerobot_memobench.sim.asset import AGENTVIEW_ANGLE, AGENTVIEW_POSITION, AGENTVIEW_QUATERNION
 
 Array = NDArray[np.float64]
 View = Mapping[str, Array] | NDArray[np.void]

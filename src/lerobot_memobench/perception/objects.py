@@ -20,8 +20,7 @@ from torch.nn.functional import normalize
 from lerobot_memobench.perception.detector import Detections, Detector, detections
 from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
-from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.classes import CLASSES, UNKNOWN_CLASS
+from lerobot_memobench.sim.asset import CLASSES, TABLE_TOP, UNKNOWN_CLASS
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes, fill_slots
 from lerobot_memobench.sim.placement import quaternion_matrix, sample_orientation

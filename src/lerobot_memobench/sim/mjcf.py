@@ -20,8 +20,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_name, refusing
 from lerobot_memobench.sim import files
-from lerobot_memobench.sim.asset import TABLE, split_class
-from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, QUARTER, Turn
+from lerobot_memobench.sim.asset import ALL_CLASSES, ARENAS, CLASSES, QUARTER, TABLE, Turn, split_class
 from lerobot_memobench.tasks.task import STRICT
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)

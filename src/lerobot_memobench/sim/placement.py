@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.asset import Asset
-from lerobot_memobench.sim.classes import Turn, arena_of
+from lerobot_memobench.sim.asset import Asset, Turn, arena_of
 from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task

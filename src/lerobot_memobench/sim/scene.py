@@ -22,21 +22,26 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import mjcf, robot
 from lerobot_memobench.sim.asset import (
+    ALL_CLASSES,
     ALONG_X,
     ALONG_Y,
+    ARENAS,
+    CLASSES,
     COLLISION_GROUP,
     SITE_GROUP,
     TABLE_SIZE,
     TABLE_TOP,
+    UNKNOWN_CLASS,
     VISUAL_GROUP,
+    Arena,
     Articulation,
     Asset,
     Grasp,
     Quaternion,
     Triple,
+    arena_of,
     split_class,
 )
-from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, UNKNOWN_CLASS, Arena, arena_of
 from lerobot_memobench.sim.files import user_folders
 from lerobot_memobench.sim.visuals import drawing_model
 from lerobot_memobench.tasks.task import STRICT, Task

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import reprlib
 import threading
 from collections import OrderedDict
@@ -21,7 +22,6 @@ from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
-from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -403,7 +403,10 @@ class Simulation:
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and the fixtures' poses."""
-        return scene_hash(self.state(), self.fixture_poses())
+        digest = hashlib.sha256(self.state().tobytes())
+        for name, pose in sorted(self.fixture_poses().items()):
+            digest.update(name.encode() + pose.tobytes())
+        return digest.hexdigest()[:16]
 
     # --- observation ----------------------------------------------------------------------------------------
 

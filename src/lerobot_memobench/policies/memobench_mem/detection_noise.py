@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.perception.objects import upright
-from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.classes import AGENTVIEW_POSITION
+from lerobot_memobench.sim.asset import AGENTVIEW_POSITION, TABLE_TOP
 from lerobot_memobench.sim.object_layout import WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import standing_heights
