@@ -196,7 +196,6 @@ class Expert:
             yield self.hand.rest(OPEN)
 
     def _run_step(self, step: Step) -> Steps:
-        """Achieve an atom, or rest at home."""
         if isinstance(step, Hold):
             rest = step.number
         else:

@@ -248,7 +248,6 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
 def _options(
     hand: Hand, name: str, grasps: Sequence[Grasp], avoid: Array | None, place: Array | None, *, reaching: bool
 ) -> list[tuple[float, _Approach]]:
-    """Return approaches to the grasps with their costs, sorted by cost."""
     options: list[tuple[float, _Approach]] = []
     shifted = _shifted_grasps(hand.sim.assets[name]) if hand.strict else ()
     for grasp in (*grasps, *shifted):
@@ -287,7 +286,6 @@ def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
 
 
 def _cost(way: _Approach, avoid: Array | None) -> float:
-    """Return the cost of a grasp: motion of wrist and arm, collisions, width and stretch."""
     hand, name = way.hand, way.name
     here, start = hand.sim.eef_pose()
     target, turn = way.pose(OPEN_WIDTH)

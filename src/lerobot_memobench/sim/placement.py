@@ -188,7 +188,6 @@ class Placer:
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
 
     def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
-        """Draw the quaternion wxyz (4,) of an object or fixture."""
         if self._assets[name].kind == "fixture":
             low, high = sorted(self._task.regions[where].yaw)
             return _quaternion("z", rng.uniform(low, high))
@@ -205,7 +204,6 @@ def _is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: Cla
 
 
 def _quaternion(axis: str, angle: float) -> Array:
-    """Return the quaternion wxyz (4,) of a rotation about x, y or z, rad."""
     q = np.zeros(4)
     q[0], q[1 + "xyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
     return q
