@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.experts.fixtures import (
-    close_door,
-    close_drawer,
-    open_door,
-    open_drawer,
-    sweep_door_open,
-    sweep_door_shut,
-    turn_knob,
-)
+from lerobot_memobench.experts import fixtures
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
 from lerobot_memobench.experts.travel import (
@@ -224,9 +216,9 @@ class Expert:
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(self.hand, name, on=True)
+                yield from fixtures.turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
-                yield from turn_knob(self.hand, name, on=False)
+                yield from fixtures.turn_knob(self.hand, name, on=False)
             case "in", (name, region):
                 yield from self._place_until_holds(atom, lambda: self._put_in(name, region))
             case "on", (name, support):
@@ -264,12 +256,12 @@ class Expert:
 
     def _open(self, name: str) -> Steps:
         # Not `Hand.strict`: the blind routine solves a published task in a strict scene.
-        door = sweep_door_open if self.task.suite == STRICT else open_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else open_drawer)(self.hand, name)
+        door = fixtures.sweep_door_open if self.task.suite == STRICT else fixtures.open_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
-        door = sweep_door_shut if self.task.suite == STRICT else close_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else close_drawer)(self.hand, name)
+        door = fixtures.sweep_door_shut if self.task.suite == STRICT else fixtures.close_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.close_drawer)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:
         drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]

@@ -130,7 +130,7 @@ class _HandleGrip:
 def open_drawer(hand: Hand, region: str) -> Steps:
     """Grasp a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    long = articulation.handle_size[0] >= OPEN_WIDTH
+    long = articulation.handle_size[0] >= OPEN_WIDTH  # a bar that fits between the fingers only diagonally
     tilt = (WIDE_HANDLE_TILT if long else HANDLE_TILT) + float(hand.rng.uniform(-0.06, 0.06))
     rolls = (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL) if long else (0.0,)
     for _ in range(MAX_ATTEMPTS):

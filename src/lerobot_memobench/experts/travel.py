@@ -89,10 +89,9 @@ def opening_direction(hand: Hand, articulation: Articulation) -> Array:
 
 def drawer_containing(hand: Hand, name: str) -> str | None:
     """Return the region of the drawer that contains an object, None without one."""
-    for asset in hand.sim.assets.values():
-        for region, articulation in asset.articulations.items():
-            if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
-                return asset.regions[region]
+    for region, (articulation, _) in hand.sim.world.joints.items():
+        if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, region))):
+            return region
     return None
 
 

@@ -14,7 +14,6 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import nan, pi
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -111,8 +110,8 @@ class Asset:
     low: Triple
     high: Triple
     grasps: tuple[Grasp, ...] = ()
-    articulations: Mapping[str, Articulation] = field(default_factory=lambda: MappingProxyType({}))
-    regions: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    articulations: Mapping[str, Articulation] = field(default_factory=dict)
+    regions: Mapping[str, str] = field(default_factory=dict)
     supports: float = 0.0
     clear_radius: float = 0.0
     glow: tuple[str, ...] = ()
@@ -154,8 +153,6 @@ Turn = tuple[str, float, float]
 """Axis (x, y or z), and the range of the angle, rad."""
 UPRIGHT: Turn = ("x", 0.0, 0.0)
 QUARTER: Turn = ("x", pi / 2, pi / 2)
-
-
 BOTTLE: tuple[Turn, ...] = (QUARTER, ("z", pi / 2, pi / 2))
 SCANNED, GROCERY, MODELLED = "stable_scanned_objects", "stable_hope_objects", "turbosquid_objects"
 FIXTURE = "articulated_objects"

@@ -58,7 +58,7 @@ def known_hashes() -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Place:
+class AssetsFolder:
     """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
 
     source: str
@@ -66,16 +66,16 @@ class Place:
     fault: str = ""
 
 
-def places() -> list[Place]:
+def places() -> list[AssetsFolder]:
     """Return the folders with LIBERO's assets in the order of use, to the first one without a fault."""
     found = []
     for source, folder in _candidates():
         try:
             _verified(folder)
         except MemobenchError as error:
-            found.append(Place(source, folder, str(error)))
+            found.append(AssetsFolder(source, folder, str(error)))
         else:
-            return [*found, Place(source, folder)]
+            return [*found, AssetsFolder(source, folder)]
     return found
 
 
@@ -88,19 +88,19 @@ def check_assets() -> Path:
     return located().folder
 
 
-def located() -> Place:
+def located() -> AssetsFolder:
     """Return the place of LIBERO's assets that is used; errors as of `check_assets`."""
     if (place := usable(found := places())) is not None:
         return place
     raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused(found)}; {OBTAIN}")
 
 
-def usable(found: Sequence[Place]) -> Place | None:
+def usable(found: Sequence[AssetsFolder]) -> AssetsFolder | None:
     """Return the one of the `places` that is used, None if all have a fault."""
     return found[-1] if found and not found[-1].fault else None
 
 
-def unused(found: Iterable[Place]) -> str:
+def unused(found: Iterable[AssetsFolder]) -> str:
     """Return the part of a message that names places with a fault."""
     return "".join(f"; not used: {place.source}, {place.fault}" for place in found if place.fault)
 
@@ -215,7 +215,7 @@ def scan(class_name: str) -> Path | None:
 # --- download and copy ---
 
 
-def obtain() -> Place:
+def obtain() -> AssetsFolder:
     """Return the place of LIBERO's assets, after downloading them to the hub's cache if no place has all files.
 
     Raises:

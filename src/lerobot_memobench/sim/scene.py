@@ -12,7 +12,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -195,7 +194,7 @@ def scene_xml(task: Task, visuals: bool) -> str:
             _add_handles(body, name, class_name)
         world.append(body)
     for class_name, known in classes.items():
-        if visuals or known.collides_by_mesh:
+        if visuals or known.collides_by_mesh:  # other files need not be found for physics
             assets.extend(mjcf.shared_assets(class_name, known))
     assets.extend(_room_assets(room, arena))
     if not visuals:
@@ -331,10 +330,8 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         low=low,
         high=high,
         grasps=(known.grasps or _by_the_sides(low, high)) if is_object else (),
-        articulations=MappingProxyType(
-            {region: replace(part, joint=f"{name}_{part.joint}") for region, part in known.parts}
-        ),
-        regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
+        articulations={region: replace(part, joint=f"{name}_{part.joint}") for region, part in known.parts},
+        regions={full.removeprefix(f"{name}_"): full for full in regions},
         supports=known.floor if contains else high[2],
         clear_radius=known.clear if contains else 0.0,
         round=known.round,

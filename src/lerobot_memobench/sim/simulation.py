@@ -219,7 +219,7 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
         if self._strict:
-            self._controller.gripper = np.array([1.0, -1.0])
+            self._controller.gripper = -robot.CLOSING_SIGNS  # the command of open fingers
         if state is not None:
             self.set_state(state)
         places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
