@@ -120,19 +120,19 @@ def plan_of(formula: Formula) -> list[Step]:
 
 def _rank(formula: Formula) -> int:
     """Return the planning order of a part: preconditions (`When`), then placements, then the rest (closing)."""
-    places = isinstance(formula, Atom) and formula.predicate in ("in", "on")
-    return 0 if isinstance(formula, When) else 1 if places else 2
+    is_placement = isinstance(formula, Atom) and formula.predicate in ("in", "on")
+    return 0 if isinstance(formula, When) else 1 if is_placement else 2
 
 
 def _merge_plans(plans: list[list[Step]]) -> list[Step]:
     """Return one plan that contains all plans, with shared steps once."""
-    whole: list[Step] = []
+    merged: list[Step] = []
     for plan in plans:
-        left = iter(whole)
-        if not all(step in left for step in plan):
-            common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
-            whole += plan[common:]
-    return whole
+        remaining = iter(merged)
+        if not all(step in remaining for step in plan):
+            common = next(n for n in range(len(plan), -1, -1) if n == 0 or merged[-n:] == plan[:n])
+            merged += plan[common:]
+    return merged
 
 
 class Expert:
@@ -266,10 +266,8 @@ class Expert:
     def _put_in(self, name: str, region: str) -> Steps:
         drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]
         if region not in drawers:
-            known = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
-            raise MemobenchError(
-                f"the expert places objects into drawers only, and {region!r} is not a drawer; {known}"
-            )
+            hint = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
+            raise MemobenchError(f"the expert places objects into drawers only, and {region!r} is not a drawer; {hint}")
         articulation, q = self.sim.world.articulation(region)
         if q > articulation.open_below:
             yield from self._open(region)

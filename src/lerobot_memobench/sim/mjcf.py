@@ -143,13 +143,13 @@ def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None
     body = outer.find("body[@name='object']") if outer is not None else None
     if outer is None or body is None:
         raise MemobenchError(f"{path} contains no body 'object'; expected an object file of LIBERO")
-    place = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
+    positions = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
     return ClassFile(
         body=_resolved(body, root),
         assets=lambda: list(_assets(root, _inside(path))) if folder is None else assets_of(root, folder),
-        radius=place["horizontal_radius_site"][0],
-        bottom=place["bottom_site"][2],
-        top=place["top_site"][2],
+        radius=positions["horizontal_radius_site"][0],
+        bottom=positions["bottom_site"][2],
+        top=positions["top_site"][2],
         turns=turns,
     )
 
@@ -221,9 +221,9 @@ def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
     }
     body = copy.deepcopy(body)
     for element in body.iter():
-        named = element.attrib.pop("class", None)
-        if named is not None:
-            element.attrib.update({**defaults.get((named, element.tag), {}), **element.attrib})
+        default_class = element.attrib.pop("class", None)
+        if default_class is not None:
+            element.attrib.update({**defaults.get((default_class, element.tag), {}), **element.attrib})
     return body
 
 
@@ -260,10 +260,10 @@ def instance(class_name: str, name: str, known: ClassFile) -> ET.Element:
 
 def shared_assets(class_name: str, known: ClassFile) -> list[ET.Element]:
     """Return a class's assets, prefixed with its name."""
-    named = []
+    assets = []
     for element in known.assets():
         element.set("name", f"{class_name}_{element.get('name')}")
         if "texture" in element.attrib:
             element.set("texture", f"{class_name}_{element.attrib['texture']}")
-        named.append(element)
-    return named
+        assets.append(element)
+    return assets

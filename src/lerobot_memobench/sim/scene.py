@@ -319,8 +319,8 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
     upright = Y_UP if known.y_up else None
     root = model.body(name).id
     low, high = _bounds(model, root, upright)
-    mine = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
-    regions = [model.site(site).name for site in np.flatnonzero(mine)]
+    own_boxes = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
+    regions = [model.site(site).name for site in np.flatnonzero(own_boxes)]
     is_object = name in task.objects
     contains = not np.isnan(known.floor)
     return Asset(
@@ -343,10 +343,10 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
 def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
     """Return grasps between opposite sides of a box, the narrower first."""
     x, y, z = (np.add(low, high) / 2).tolist()
-    place = (x, y, max(z, high[2] - GRASP_DEPTH))
+    centre = (x, y, max(z, high[2] - GRASP_DEPTH))
     widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
     return tuple(
-        Grasp(place, yaw, widths[yaw])
+        Grasp(centre, yaw, widths[yaw])
         for yaw in sorted(widths, key=widths.__getitem__)
         if widths[yaw] <= MAX_GRASP_WIDTH
     )

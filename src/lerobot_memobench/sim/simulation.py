@@ -222,7 +222,7 @@ class Simulation:
             self._controller.gripper = -robot.CLOSING_SIGNS  # the command of open fingers
         if state is not None:
             self.set_state(state)
-        places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
+        drawn_positions = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
         for step in range(STABILISATION_STEPS):
             if state is None:
                 self.step(NO_OP)
@@ -231,7 +231,7 @@ class Simulation:
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
-        shifts = [self.data.body(name).xpos[:2] - place[:2] for name, place in places.items()]
+        shifts = [self.data.body(name).xpos[:2] - position[:2] for name, position in drawn_positions.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED
 

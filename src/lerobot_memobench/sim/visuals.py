@@ -49,16 +49,16 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     Raises:
         ValueError: MuJoCo cannot read a file.
     """
-    seen = {geom.meshname for geom in spec.geoms if geom.group == VISUAL_GROUP}
+    drawn = {geom.meshname for geom in spec.geoms if geom.group == VISUAL_GROUP}
     for mesh in spec.meshes:
-        if mesh.name not in seen and mesh.file:
+        if mesh.name not in drawn and mesh.file:
             _use_placeholder(mesh)
     files = [(_key(part), part) for part in [*spec.meshes, *spec.textures] if part.file]
     cached = {key: arrays for key, _ in files if (arrays := _read_cache(key)) is not None}
     missing = {key: part for key, part in files if key not in cached}
     if missing:
-        whole = spec.copy().compile()
-        cached |= {key: _write_cache(key, _extract(whole, part)) for key, part in missing.items()}
+        full_model = spec.copy().compile()
+        cached |= {key: _write_cache(key, _extract(full_model, part)) for key, part in missing.items()}
     meshes, shapes = {}, {}
     for key, part in files:
         if isinstance(part, mujoco.MjsMesh):
@@ -144,8 +144,8 @@ def _thinned(shape: Triangles) -> Triangles:
     corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
     if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
         return shape
-    off = np.linalg.norm(spots - corners[moved], axis=1)
-    order = np.lexsort((-off, moved))  # the nearest vertex of each is written last
+    distance = np.linalg.norm(spots - corners[moved], axis=1)
+    order = np.lexsort((-distance, moved))  # the nearest vertex of each is written last
     nearest = np.zeros(len(corners), np.int64)
     nearest[moved[order]] = order
     flat = np.cross(corners[thin[:, 1]] - corners[thin[:, 0]], corners[thin[:, 2]] - corners[thin[:, 0]])
