@@ -82,12 +82,12 @@ class PromptDemonstrator:
         self.succeeded = all(self._sim.holds(atom) for atom in (*hidden, HAND_HOME))
 
     def _pick(self, hand: Hand) -> Steps:
-        place, turned = self._sim.asset_pose(self._referent)
+        position, rotation = self._sim.asset_pose(self._referent)
         held = yield from pick(hand, self._referent)
         if held is not None:
             self.succeeded = True
             yield from hand.wait(PAUSE_STEPS, CLOSED)
-            yield from put_at(hand, held, place, turned)
+            yield from put_at(hand, held, position, rotation)
 
     def _point(self, hand: Hand) -> Steps:
         place, _ = self._sim.asset_pose(self._referent)

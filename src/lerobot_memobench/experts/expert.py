@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.experts.fixtures import (
-    close_door,
-    close_drawer,
-    open_door,
-    open_drawer,
-    sweep_door_open,
-    sweep_door_shut,
-    turn_knob,
-)
+from lerobot_memobench.experts import fixtures
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
 from lerobot_memobench.experts.travel import (
@@ -128,19 +120,19 @@ def plan_of(formula: Formula) -> list[Step]:
 
 def _rank(formula: Formula) -> int:
     """Return the planning order of a part: preconditions (`When`), then placements, then the rest (closing)."""
-    places = isinstance(formula, Atom) and formula.predicate in ("in", "on")
-    return 0 if isinstance(formula, When) else 1 if places else 2
+    is_placement = isinstance(formula, Atom) and formula.predicate in ("in", "on")
+    return 0 if isinstance(formula, When) else 1 if is_placement else 2
 
 
 def _merge_plans(plans: list[list[Step]]) -> list[Step]:
     """Return one plan that contains all plans, with shared steps once."""
-    whole: list[Step] = []
+    merged: list[Step] = []
     for plan in plans:
-        left = iter(whole)
-        if not all(step in left for step in plan):
-            common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
-            whole += plan[common:]
-    return whole
+        remaining = iter(merged)
+        if not all(step in remaining for step in plan):
+            common = next(n for n in range(len(plan), -1, -1) if n == 0 or merged[-n:] == plan[:n])
+            merged += plan[common:]
+    return merged
 
 
 class Expert:
@@ -196,7 +188,6 @@ class Expert:
             yield self.hand.rest(OPEN)
 
     def _run_step(self, step: Step) -> Steps:
-        """Achieve an atom, or rest at home."""
         if isinstance(step, Hold):
             rest = step.number
         else:
@@ -225,9 +216,9 @@ class Expert:
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(self.hand, name, on=True)
+                yield from fixtures.turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
-                yield from turn_knob(self.hand, name, on=False)
+                yield from fixtures.turn_knob(self.hand, name, on=False)
             case "in", (name, region):
                 yield from self._place_until_holds(atom, lambda: self._put_in(name, region))
             case "on", (name, support):
@@ -265,20 +256,18 @@ class Expert:
 
     def _open(self, name: str) -> Steps:
         # Not `Hand.strict`: the blind routine solves a published task in a strict scene.
-        door = sweep_door_open if self.task.suite == STRICT else open_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else open_drawer)(self.hand, name)
+        door = fixtures.sweep_door_open if self.task.suite == STRICT else fixtures.open_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
-        door = sweep_door_shut if self.task.suite == STRICT else close_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else close_drawer)(self.hand, name)
+        door = fixtures.sweep_door_shut if self.task.suite == STRICT else fixtures.close_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.close_drawer)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:
         drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]
         if region not in drawers:
-            known = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
-            raise MemobenchError(
-                f"the expert places objects into drawers only, and {region!r} is not a drawer; {known}"
-            )
+            hint = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
+            raise MemobenchError(f"the expert places objects into drawers only, and {region!r} is not a drawer; {hint}")
         articulation, q = self.sim.world.articulation(region)
         if q > articulation.open_below:
             yield from self._open(region)

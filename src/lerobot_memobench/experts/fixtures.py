@@ -79,7 +79,6 @@ MAX_SWEEP_STEPS = 150
 
 
 def _joint_position(hand: Hand, name: str) -> float:
-    """Return the present position of a drawer, door or knob, m or rad."""
     return hand.sim.world.articulation(name)[1]
 
 
@@ -131,7 +130,7 @@ class _HandleGrip:
 def open_drawer(hand: Hand, region: str) -> Steps:
     """Grasp a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    long = articulation.handle_size[0] >= OPEN_WIDTH
+    long = articulation.handle_size[0] >= OPEN_WIDTH  # a bar that fits between the fingers only diagonally
     tilt = (WIDE_HANDLE_TILT if long else HANDLE_TILT) + float(hand.rng.uniform(-0.06, 0.06))
     rolls = (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL) if long else (0.0,)
     for _ in range(MAX_ATTEMPTS):
@@ -191,7 +190,6 @@ def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Arr
 
 
 def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:
-    """Move the closed fingers in front of a handle, from above."""
 
     def before(gap: float) -> Array:
         return hand.sim.site_pose(articulation.handle_site)[0] + gap * out + aside
@@ -251,7 +249,6 @@ def _take_ridge(hand: Hand, articulation: Articulation) -> Steps:
 
 
 def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> Steps:
-    """Turn a grasped knob to the position ``aim``, rad."""
     grip = hand.rotation
     articulation, start = hand.sim.world.articulation(name)
     for _ in range(100):
@@ -331,7 +328,6 @@ def close_door(hand: Hand, name: str) -> Steps:
 
 
 def _pull_door(hand: Hand, name: str) -> Steps:
-    """Grasp the upper end of a vertical handle and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
     up = (articulation.handle_size[0] / 2 - HANDLE_GRIP_DEPTH) * UP
     flip = _closing_sign(door_geometry(hand, name).along)
@@ -358,7 +354,6 @@ def _pull_door(hand: Hand, name: str) -> Steps:
 
 
 def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
-    """Grasp a partly open door by its upper edge and follow its arc."""
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
@@ -398,7 +393,6 @@ def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: 
 
 
 def _push_door(hand: Hand, name: str) -> Steps:
-    """Close a door with closed fingers on the outside of its handle."""
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
     flip = _closing_sign(door_geometry(hand, name).along)

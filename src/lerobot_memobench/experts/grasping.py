@@ -185,8 +185,8 @@ class _Approach:
         reach = reach_lean(self.hand, target)
         if self.place is not None:
             position, _ = self.hand.sim.asset_pose(self.name)
-            there = reach_lean(self.hand, self.place + target - position, MAX_STRETCH)
-            reach = max(reach, there, key=length)
+            reach_at_destination = reach_lean(self.hand, self.place + target - position, MAX_STRETCH)
+            reach = max(reach, reach_at_destination, key=length)
         away = away + reach - (reach @ closing) * closing
         if outward is not None:
             # On the base's side the fingers may lean along the bowl's sloping wall.
@@ -241,20 +241,21 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
     options = [option for option in options if option[0] < options[0][0] + MAX_EXTRA_COST]
     # Later attempts take the next distinct candidate, with a small random variation.
     rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
-    _, way = options[rank]
-    return replace(way, spin=way.spin + float(hand.rng.uniform(-0.1, 0.1))) if way.grasp.symmetric else way
+    approach = options[rank][1]
+    if approach.grasp.symmetric:
+        approach = replace(approach, spin=approach.spin + float(hand.rng.uniform(-0.1, 0.1)))
+    return approach
 
 
 def _options(
     hand: Hand, name: str, grasps: Sequence[Grasp], avoid: Array | None, place: Array | None, *, reaching: bool
 ) -> list[tuple[float, _Approach]]:
-    """Return approaches to the grasps with their costs, sorted by cost."""
     options: list[tuple[float, _Approach]] = []
     shifted = _shifted_grasps(hand.sim.assets[name]) if hand.strict else ()
     for grasp in (*grasps, *shifted):
         for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
-            way = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
-            options.append((_cost(way, avoid), way))
+            approach = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
+            options.append((_cost(approach, avoid), approach))
     return sorted(options, key=lambda option: option[0])
 
 
@@ -272,7 +273,7 @@ def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
 
     They leave room for the hand, or for a finger, between the box and an obstacle. A taller box would tip over.
     """
-    found = []
+    grasps = []
     for grasp in asset.grasps:
         if grasp.symmetric or not asset.top - asset.bottom < grasp.width < WIDE_GRASP:
             continue
@@ -282,32 +283,31 @@ def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
         side = (OPEN_WIDTH - grasp.width) / 2 - MIN_SIDE_GAP
         for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)):
             x, y = np.asarray(grasp.position[:2]) + a * ends * along + b * side * across
-            found.append(replace(grasp, position=(float(x), float(y), grasp.position[2])))
-    return tuple(found)
+            grasps.append(replace(grasp, position=(float(x), float(y), grasp.position[2])))
+    return tuple(grasps)
 
 
-def _cost(way: _Approach, avoid: Array | None) -> float:
-    """Return the cost of a grasp: motion of wrist and arm, collisions, width and stretch."""
-    hand, name = way.hand, way.name
+def _cost(approach: _Approach, avoid: Array | None) -> float:
+    hand, name = approach.hand, approach.name
     here, start = hand.sim.eef_pose()
-    target, turn = way.pose(OPEN_WIDTH)
+    target, turn = approach.pose(OPEN_WIDTH)
     wrist = length(rotation_vector(turn @ start.T))
     cost = 0.3 * wrist + length(target - here) + finger_obstruction_cost(hand, name, target, turn)
     if avoid is not None:
         cost += 2.0 * abs(float(turn[:, 0] @ avoid))
     cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
     blocked = hand_penetration(hand, name, target, turn)
-    if way.shifted:  # without the margin: the hand pushes its neighbour by a few millimetres
+    if approach.shifted:  # without the margin: the hand pushes its neighbour by a few millimetres
         cost += SHIFTED_COST + 100.0 * max(0.0, blocked - HAND_MARGIN)
     else:
-        cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
-    cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
+        cost += (0.0 if approach.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
+    cost += 0.3 if approach.grasp.width > WIDE_GRASP else 0.0
     position, _ = hand.sim.asset_pose(name)
-    if _is_rim(hand, name, way.grasp):
+    if _is_rim(hand, name, approach.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
-    ends = [target] if way.place is None else [target, way.place + target - position]
+    ends = [target] if approach.place is None else [target, approach.place + target - position]
     stretch = max(hand.stretch(end, turn) for end in ends)
-    if way.grasp.width >= TIGHT_GRASP and hand.strict:
+    if approach.grasp.width >= TIGHT_GRASP and hand.strict:
         cost += TIGHT_COST * (2.0 if hand.stretch(target, turn) > MAX_STRETCH else 1.0)
     # Beyond `MAX_STRETCH` the hand stops short and closes on an edge, which slips.
     return cost + 20.0 * max(0.0, stretch - COMFORTABLE_STRETCH) + 40.0 * max(0.0, stretch - MAX_STRETCH)
@@ -329,17 +329,16 @@ def pick(
     """
     failed = 0
     for attempt in range(MAX_ATTEMPTS):
-        way = _choose_grasp(hand, name, failed, avoid, place)
-        upright = hand.sim.asset_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
+        approach = _choose_grasp(hand, name, failed, avoid, place)
+        upright = hand.sim.asset_pose(name)[1][2, 2] if _is_rim(hand, name, approach.grasp) else -1.0
         yield from rise(hand, OPEN)
-        yield from travel(hand, way.above, way.turned, OPEN, target=name)
-        yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-        speed, timeout = (0.6, 60) if way.grasp.width < TIGHT_GRASP else (TIGHT_GRASP_SPEED, 120)
-        yield from hand.move(
-            *(way.at, way.turned, OPEN), tolerance=0.005, speed=speed, timeout=timeout, give_up=way.stall_check()
-        )
+        yield from travel(hand, approach.above, approach.turned, OPEN, target=name)
+        yield from hand.move(approach.above, approach.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+        speed, timeout = (0.6, 60) if approach.grasp.width < TIGHT_GRASP else (TIGHT_GRASP_SPEED, 120)
+        at, turned, stalled = approach.at, approach.turned, approach.stall_check()
+        yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=speed, timeout=timeout, give_up=stalled)
         # At a shifted grasp the first finger pushes the object to the other one, so the hand does not follow it.
-        yield from hand.close(None if way.shifted else way.closing, hand.rotation)
+        yield from hand.close(None if approach.shifted else approach.closing, hand.rotation)
         # After a miss retry at once, first at the same place. Otherwise policies would learn to lift an empty hand, or
         # to change the grasp without a visible reason.
         failed += attempt > 0 or not hand.empty

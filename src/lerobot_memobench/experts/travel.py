@@ -89,10 +89,9 @@ def opening_direction(hand: Hand, articulation: Articulation) -> Array:
 
 def drawer_containing(hand: Hand, name: str) -> str | None:
     """Return the region of the drawer that contains an object, None without one."""
-    for asset in hand.sim.assets.values():
-        for region, articulation in asset.articulations.items():
-            if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
-                return asset.regions[region]
+    for region, (articulation, _) in hand.sim.world.joints.items():
+        if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, region))):
+            return region
     return None
 
 
@@ -213,17 +212,17 @@ def clear_of_objects(
     are tried, rad.
     """
     side = cross(UP, closing)
-    best, least = leaned_rotation(closing, away), np.inf
+    best, least_cost = leaned_rotation(closing, away), np.inf
     for more in (largest / MAX_LEAN * candidate for candidate in LEAN_CANDIDATES):
         if abs(float(away @ side) + more) > largest and more != 0.0:
             continue
         turn = leaned_rotation(closing, away + more * side)
-        bad = hand_penetration(hand, name, target, turn)
+        cost = hand_penetration(hand, name, target, turn)
         if reaching:
-            bad += max(0.0, hand.stretch(target, turn) - MAX_STRETCH)
-        if bad < least - 0.002:
-            best, least = turn, bad
-        if least <= 0.0:
+            cost += max(0.0, hand.stretch(target, turn) - MAX_STRETCH)
+        if cost < least_cost - 0.002:
+            best, least_cost = turn, cost
+        if least_cost <= 0.0:
             break
     return best
 

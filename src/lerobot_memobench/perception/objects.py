@@ -20,12 +20,12 @@ from torch.nn.functional import normalize
 
 from lerobot_memobench.perception.detector import Detections, Detector, detections
 from lerobot_memobench.perception.visual_encoder import resized
-from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.classes import (
+from lerobot_memobench.sim.asset import (
     AGENTVIEW_ANGLE,
     AGENTVIEW_POSITION,
     AGENTVIEW_QUATERNION,
     CLASSES,
+    TABLE_TOP,
     UNKNOWN_CLASS,
 )
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field

@@ -46,8 +46,8 @@ OBTAIN = f"run: memobench assets (from the hub), or: {INSTALL}; without a networ
 
 def user_folders() -> tuple[str, ...]:
     """Return the absolute paths in the environment variables, on which scenes depend; "" for a variable without one."""
-    named = (os.environ.get(variable) for variable in (SCANS_VARIABLE, OBJECTS_VARIABLE))
-    return tuple(os.path.abspath(os.path.expanduser(path)) if path else "" for path in named)
+    paths = (os.environ.get(variable) for variable in (SCANS_VARIABLE, OBJECTS_VARIABLE))
+    return tuple(os.path.abspath(os.path.expanduser(path)) if path else "" for path in paths)
 
 
 @cache
@@ -58,7 +58,7 @@ def known_hashes() -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Place:
+class AssetsFolder:
     """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
 
     source: str
@@ -66,17 +66,17 @@ class Place:
     fault: str = ""
 
 
-def places() -> list[Place]:
+def places() -> list[AssetsFolder]:
     """Return the folders with LIBERO's assets in the order of use, to the first one without a fault."""
-    found = []
+    folders = []
     for source, folder in _candidates():
         try:
             _verified(folder)
         except MemobenchError as error:
-            found.append(Place(source, folder, str(error)))
+            folders.append(AssetsFolder(source, folder, str(error)))
         else:
-            return [*found, Place(source, folder)]
-    return found
+            return [*folders, AssetsFolder(source, folder)]
+    return folders
 
 
 def check_assets() -> Path:
@@ -88,32 +88,27 @@ def check_assets() -> Path:
     return located().folder
 
 
-def located() -> Place:
+def located() -> AssetsFolder:
     """Return the place of LIBERO's assets that is used; errors as of `check_assets`."""
-    if (place := usable(found := places())) is not None:
-        return place
-    raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused(found)}; {OBTAIN}")
+    if (folder := usable(folders := places())) is not None:
+        return folder
+    raise MemobenchError(
+        f"LIBERO's assets, which every scene needs, are not on this machine{unused(folders)}; {OBTAIN}"
+    )
 
 
-def usable(found: Sequence[Place]) -> Place | None:
+def usable(found: Sequence[AssetsFolder]) -> AssetsFolder | None:
     """Return the one of the `places` that is used, None if all have a fault."""
     return found[-1] if found and not found[-1].fault else None
 
 
-def unused(found: Iterable[Place]) -> str:
+def unused(found: Iterable[AssetsFolder]) -> str:
     """Return the part of a message that names places with a fault."""
     return "".join(f"; not used: {place.source}, {place.fault}" for place in found if place.fault)
 
 
 def asset(name: str) -> Path:
-    """Return the path of a verified LIBERO file.
-
-    Args:
-        name: path below the assets folder, one of `known_hashes`.
-
-    Raises:
-        MemobenchError: as `check_assets`.
-    """
+    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `check_assets`."""
     return _verified(check_assets())[name]
 
 
@@ -175,16 +170,16 @@ def user_objects(built_in: Collection[str]) -> dict[str, Path]:
     Raises:
         MemobenchError: the user's folder does not exist, or contains a class in ``built_in``.
     """
-    named = user_folders()[-1]
-    if not named:
+    setting = user_folders()[-1]
+    if not setting:
         return {}
-    folder = Path(named)
+    folder = Path(setting)
     if not folder.is_dir():
-        raise MemobenchError(f"{OBJECTS_VARIABLE} is {named!r}, expected a folder with files <class>/<class>.xml")
-    found = {child.name: child / f"{child.name}.xml" for child in folder.iterdir() if child.is_dir()}
-    for name in sorted(found.keys() & set(built_in)):
+        raise MemobenchError(f"{OBJECTS_VARIABLE} is {setting!r}, expected a folder with files <class>/<class>.xml")
+    classes = {child.name: child / f"{child.name}.xml" for child in folder.iterdir() if child.is_dir()}
+    for name in sorted(classes.keys() & set(built_in)):
         raise MemobenchError(f"{folder / name} has the name of a built-in class; rename the folder and its file")
-    return found
+    return classes
 
 
 def scan(class_name: str) -> Path | None:
@@ -195,16 +190,16 @@ def scan(class_name: str) -> Path | None:
     Raises:
         MemobenchError: the folder or the scan does not exist.
     """
-    named = os.environ.get(SCANS_VARIABLE)
-    if not named:
+    setting = os.environ.get(SCANS_VARIABLE)
+    if not setting:
         return None
     category, number = split_class(class_name)
-    folder = Path(named).expanduser() / category
+    folder = Path(setting).expanduser() / category
     if not folder.is_dir():
         if not (OWN_OBJECTS / class_name).is_dir():
             return None
         raise MemobenchError(
-            f"{SCANS_VARIABLE} is {named!r}, which contains no folder {category!r}; set it to the authors' folder "
+            f"{SCANS_VARIABLE} is {setting!r}, which contains no folder {category!r}; set it to the authors' folder "
             "new_objects, or unset it to use this package's objects instead of the scans"
         )
     names = sorted(child.name for child in folder.iterdir() if child.is_dir())
@@ -222,7 +217,7 @@ def scan(class_name: str) -> Path | None:
 # --- download and copy ---
 
 
-def obtain() -> Place:
+def obtain() -> AssetsFolder:
     """Return the place of LIBERO's assets, after downloading them to the hub's cache if no place has all files.
 
     Raises:
@@ -231,10 +226,10 @@ def obtain() -> Place:
     import httpx
     from huggingface_hub import snapshot_download
 
-    found = places()
-    if (place := usable(found)) is not None:
+    folders = places()
+    if (place := usable(folders)) is not None:
         return place
-    wanted, damaged = [*known_hashes()], any(place.source == HUB_CACHE for place in found)
+    wanted, damaged = [*known_hashes()], any(place.source == HUB_CACHE for place in folders)
     try:
         snapshot_download(REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
     except (OSError, httpx.TransportError) as error:

@@ -20,8 +20,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import file_name, refusing
 from lerobot_memobench.sim import files
-from lerobot_memobench.sim.asset import TABLE, split_class
-from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, QUARTER, Turn
+from lerobot_memobench.sim.asset import ALL_CLASSES, ARENAS, CLASSES, QUARTER, TABLE, Turn, split_class
 from lerobot_memobench.tasks.task import STRICT
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
@@ -144,13 +143,13 @@ def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None
     body = outer.find("body[@name='object']") if outer is not None else None
     if outer is None or body is None:
         raise MemobenchError(f"{path} contains no body 'object'; expected an object file of LIBERO")
-    place = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
+    positions = {site.get("name"): parse_numbers(site.get("pos", "")) for site in outer.findall("site")}
     return ClassFile(
-        body=_with_defaults_resolved(body, _defaults(root)),
+        body=_resolved(body, root),
         assets=lambda: list(_assets(root, _inside(path))) if folder is None else assets_of(root, folder),
-        radius=place["horizontal_radius_site"][0],
-        bottom=place["bottom_site"][2],
-        top=place["top_site"][2],
+        radius=positions["horizontal_radius_site"][0],
+        bottom=positions["bottom_site"][2],
+        top=positions["top_site"][2],
         turns=turns,
     )
 
@@ -172,23 +171,19 @@ def _scanned_class(path: Path) -> ClassFile:
     """Read a scan; its size is computed from vertices because it has no sites."""
     root = _read(path)
     body = root.find("worldbody/body")
-    points = [line.split()[1:4] for file in sorted(path.parent.glob("visuals/*.obj")) for line in _vertex_lines(file)]
+    lines = (line for file in sorted(path.parent.glob("visuals/*.obj")) for line in file.read_text().splitlines())
+    points = [line.split()[1:4] for line in lines if line.startswith("v ")]
     if body is None or not points:
         raise MemobenchError(f"the scan {path} lacks its body or its visuals/*.obj; download the scans again")
     vertices = np.array(points, dtype=np.float64)
-
     return ClassFile(
-        body=_with_defaults_resolved(body, _defaults(root)),
+        body=_resolved(body, root),
         assets=lambda: list(_assets(root, _inside(path))),
         radius=float(np.abs(vertices[:, :2]).max()),
         bottom=float(vertices[:, 2].min()),
         top=float(vertices[:, 2].max()),
         turns=SCAN_TURNS,
     )
-
-
-def _vertex_lines(file: Path) -> Iterator[str]:
-    return (line for line in file.read_text().splitlines() if line.startswith("v "))
 
 
 # --- MJCF ---
@@ -216,23 +211,19 @@ def format_numbers(values: Iterable[float]) -> str:
     return " ".join(repr(float(value)) for value in values)
 
 
-def _defaults(root: ET.Element) -> dict[tuple[str, str], dict[str, str]]:
-    """Return class and tag -> attributes."""
-    return {
-        (default.get("class", ""), element.tag): dict(element.attrib)
+def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
+    """Return a copy of a body with the file's default classes resolved."""
+    defaults = {
+        (default.get("class", ""), element.tag): element.attrib
         for default in root.iter("default")
         for element in default
         if element.tag != "default"
     }
-
-
-def _with_defaults_resolved(body: ET.Element, defaults: dict[tuple[str, str], dict[str, str]]) -> ET.Element:
-    """Return a copy of a body with default classes resolved."""
     body = copy.deepcopy(body)
     for element in body.iter():
-        named = element.attrib.pop("class", None)
-        if named is not None:
-            element.attrib.update({**defaults.get((named, element.tag), {}), **element.attrib})
+        default_class = element.attrib.pop("class", None)
+        if default_class is not None:
+            element.attrib.update({**defaults.get((default_class, element.tag), {}), **element.attrib})
     return body
 
 
@@ -269,10 +260,10 @@ def instance(class_name: str, name: str, known: ClassFile) -> ET.Element:
 
 def shared_assets(class_name: str, known: ClassFile) -> list[ET.Element]:
     """Return a class's assets, prefixed with its name."""
-    named = []
+    assets = []
     for element in known.assets():
         element.set("name", f"{class_name}_{element.get('name')}")
         if "texture" in element.attrib:
             element.set("texture", f"{class_name}_{element.attrib['texture']}")
-        named.append(element)
-    return named
+        assets.append(element)
+    return assets

@@ -136,7 +136,7 @@ class ObjectSlots:
     def _surface(self, index: int, body: int) -> Array:
         """Return `POINTS_PER_THING` distant points slightly inside a thing's opaque geoms, in its body's frame."""
         model = self._sim.model
-        found = []
+        surfaces = []
         for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == COLLISION_GROUP)):
             points = _geom_points(model, geom)
             points = points @ quaternion_matrix(model.geom_quat[geom]).T + model.geom_pos[geom]
@@ -144,8 +144,8 @@ class ObjectSlots:
             while inner != body:
                 points = points @ quaternion_matrix(model.body_quat[inner]).T + model.body_pos[inner]
                 inner = model.body_parentid[inner]
-            found.append(points)
-        points = _farthest(np.concatenate(found), POINTS_PER_THING)
+            surfaces.append(points)
+        points = _farthest(np.concatenate(surfaces), POINTS_PER_THING)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         return middle + 0.94 * (points - middle)
 
@@ -175,10 +175,10 @@ class ObjectSlots:
     def _row(self, thing: Thing) -> Array:
         data = self._sim.data
         position = self.position(thing)
-        turned = data.xmat[thing.body].reshape(3, 3)
+        rotation = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
         lit = float(is_lit(position, self._sim.highlights))
-        pose = _rounded(np.array([*position, *turned[:, 0], *turned[:, 1], joint]))
+        pose = _rounded(np.array([*position, *rotation[:, 0], *rotation[:, 1], joint]))
         return np.array([1.0, thing.kind, *pose, lit]) + 0.0  # no negative zeros
 
 

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.asset import Asset
-from lerobot_memobench.sim.classes import Turn, arena_of
+from lerobot_memobench.sim.asset import Asset, Turn, arena_of
 from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
@@ -42,13 +41,13 @@ Pose = NDArray[np.float64]
 
 def _placing_atoms(task: Task, assets: Iterable[str]) -> list[Atom]:
     """Return the placing `init` atom of each instance, in the order of `init`."""
-    places = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
-    missing = [name for name in assets if name not in places]
+    placing = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+    missing = [name for name in assets if name not in placing]
     if missing:
         raise MemobenchError(
             f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
         )
-    return list(places.values())
+    return list(placing.values())
 
 
 class Placer:
@@ -128,15 +127,15 @@ class Placer:
 
     def _joint_ranges(self, atom: Atom) -> dict[str, tuple[float, float]]:
         """Return joint -> range of an atom's predicate, for all parts of a fixture or the part of a region."""
-        found = {
+        ranges = {
             part.joint: part.ranges[atom.predicate]
             for instance, asset in self._assets.items()
             for region, part in asset.articulations.items()
             if atom.args[0] in (instance, f"{instance}_{region}") and atom.predicate in part.ranges
         }
-        if not found:
+        if not ranges:
             raise MemobenchError(f"task {self._task.name}: {atom} of :init applies to no joint")
-        return found
+        return ranges
 
     # --- places ---
 
@@ -152,9 +151,9 @@ class Placer:
         known, z = self._files[name], base[2] - self._files[name].bottom
         for _ in range(MAX_DRAWS):
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
-            place = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
-            if all(_is_clear_of(known, place, self._files[other], others[other]) for other in others):
-                return np.array([*place, *self._turn(name, where, rng)])
+            position = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
+            if all(_is_clear_of(known, position, self._files[other], others[other]) for other in others):
+                return np.array([*position, *self._turn(name, where, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "
             "position; move the regions of its :init apart"
@@ -189,24 +188,22 @@ class Placer:
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
 
     def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
-        """Draw the quaternion wxyz (4,) of an object or fixture."""
         if self._assets[name].kind == "fixture":
             low, high = sorted(self._task.regions[where].yaw)
             return _quaternion("z", rng.uniform(low, high))
         return sample_orientation(self._files[name].turns, rng)
 
 
-def _is_clear_of(thing: ClassFile, place: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
+def _is_clear_of(thing: ClassFile, position: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
     """Return whether an object's disc is clear of another's, or far enough above it."""
-    distance = np.hypot(place[0] - pose[0], place[1] - pose[1])
-    return bool(distance > other.radius + thing.radius or place[2] - pose[2] > other.top - thing.bottom)
+    distance = np.hypot(position[0] - pose[0], position[1] - pose[1])
+    return bool(distance > other.radius + thing.radius or position[2] - pose[2] > other.top - thing.bottom)
 
 
 # --- turns ---
 
 
 def _quaternion(axis: str, angle: float) -> Array:
-    """Return the quaternion wxyz (4,) of a rotation about x, y or z, rad."""
     q = np.zeros(4)
     q[0], q[1 + "xyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
     return q

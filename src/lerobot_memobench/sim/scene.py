@@ -12,7 +12,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
-from types import MappingProxyType
 
 import mujoco
 import numpy as np
@@ -22,24 +21,28 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import mjcf, robot
 from lerobot_memobench.sim.asset import (
+    ALL_CLASSES,
     ALONG_X,
     ALONG_Y,
+    ARENAS,
+    CLASSES,
     COLLISION_GROUP,
     SITE_GROUP,
     TABLE_SIZE,
     TABLE_TOP,
+    UNKNOWN_CLASS,
     VISUAL_GROUP,
+    Arena,
     Articulation,
     Asset,
     Grasp,
     Quaternion,
     Triple,
+    arena_of,
     split_class,
 )
-from lerobot_memobench.sim.classes import ALL_CLASSES, ARENAS, CLASSES, UNKNOWN_CLASS, Arena, arena_of
 from lerobot_memobench.sim.files import user_folders
 from lerobot_memobench.sim.visuals import drawing_model
-from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.task import STRICT, Task
 from mujoco_raster.drawlist import DrawList
 
@@ -149,12 +152,7 @@ def instances(task: Task) -> Iterator[tuple[str, str]]:
 
 
 def scene_spec(task: Task, visuals: bool = False) -> mujoco.MjSpec:
-    """Return a task's scene as an editable specification.
-
-    Args:
-        task: task of the scene.
-        visuals: whether to include visual geoms, materials and lights.
-    """
+    """Return a task's scene as an editable specification, with or without visual geoms, materials and lights."""
     spec = mujoco.MjSpec.from_string(scene_xml(task, visuals))
     spec.modelname = "libero"
     spec.nconmax, spec.njmax, spec.memory = -1, -1, ARENA_BYTES
@@ -196,7 +194,7 @@ def scene_xml(task: Task, visuals: bool) -> str:
             _add_handles(body, name, class_name)
         world.append(body)
     for class_name, known in classes.items():
-        if visuals or known.collides_by_mesh:
+        if visuals or known.collides_by_mesh:  # other files need not be found for physics
             assets.extend(mjcf.shared_assets(class_name, known))
     assets.extend(_room_assets(room, arena))
     if not visuals:
@@ -209,8 +207,7 @@ def scene_xml(task: Task, visuals: bool) -> str:
 
 def _place_arm(world: ET.Element, arena: Arena) -> None:
     """Move the arm to its place in an arena, and remove its mount in arenas without one."""
-    base = next(body for body in world.iter("body") if body.get("name") == "robot0_base")
-    mount = next(body for body in base.iter("body") if body.get("name") == "mount0_base")
+    base, mount = _body(world, "robot0_base"), _body(world, "mount0_base")
     x, y, z = arena.base
     if arena.mounted:
         z = mjcf.parse_numbers(base.attrib["pos"])[2]
@@ -218,6 +215,10 @@ def _place_arm(world: ET.Element, arena: Arena) -> None:
         mount.clear()
         mount.attrib.update(name="mount0_base", pos="0 0 0")
     base.set("pos", mjcf.format_numbers((x, y, z)))
+
+
+def _body(root: ET.Element, name: str) -> ET.Element:
+    return next(body for body in root.iter("body") if body.get("name") == name)
 
 
 def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
@@ -255,18 +256,13 @@ def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> 
 
 def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
     """Yield the sites of the table's regions, one for the first range of each."""
+    x, y, z = arena.zones
     for name, region in task.regions.items():
         if task.fixtures.get(region.target) in ARENAS and region.ranges:
-            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), **_zone(arena, region)})
-
-
-def _zone(arena: Arena, region: Region) -> dict[str, str]:
-    x1, y1, x2, y2 = region.ranges[0]
-    x, y, z = arena.zones
-    return {
-        "pos": mjcf.format_numbers(((x2 + x1) / 2 + x, (y2 + y1) / 2 + y, z)),
-        "size": mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT)),
-    }
+            x1, y1, x2, y2 = region.ranges[0]
+            pos = mjcf.format_numbers(((x2 + x1) / 2 + x, (y2 + y1) / 2 + y, z))
+            size = mjcf.format_numbers(((x2 - x1) / 2, (y2 - y1) / 2, ZONE_HALF_HEIGHT))
+            yield ET.Element("site", {"name": name, "type": "box", "group": str(SITE_GROUP), "pos": pos, "size": size})
 
 
 def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
@@ -283,15 +279,10 @@ def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
 
 def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
     """Add an invisible site at the centre of each handle, for experts."""
-    for _, part in _parts(class_name):
-        moving = next(one for one in body.iter("body") if one.get("name") == f"{name}_{part.body}")
+    for _, part in ALL_CLASSES.get(class_name, UNKNOWN_CLASS).parts:
         pose = {"pos": mjcf.format_numbers(part.handle), "quat": mjcf.format_numbers(part.handle_quaternion)}
         site = {"name": f"{name}_{part.handle_site}", "group": str(SITE_GROUP), **pose, "size": "0.005"}
-        moving.append(ET.Element("site", site))
-
-
-def _parts(class_name: str) -> tuple[tuple[str, Articulation], ...]:
-    return ALL_CLASSES.get(class_name, UNKNOWN_CLASS).parts
+        _body(body, f"{name}_{part.body}").append(ET.Element("site", site))
 
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
@@ -324,13 +315,12 @@ def standing_heights() -> dict[str, float]:
 
 
 def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Asset:
-    """Return the facts about an instance."""
     known = ALL_CLASSES.get(class_name, UNKNOWN_CLASS)
     upright = Y_UP if known.y_up else None
     root = model.body(name).id
     low, high = _bounds(model, root, upright)
-    mine = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
-    regions = [model.site(site).name for site in np.flatnonzero(mine)]
+    own_boxes = (model.body_rootid[model.site_bodyid] == root) & (model.site_type == mujoco.mjtGeom.mjGEOM_BOX)
+    regions = [model.site(site).name for site in np.flatnonzero(own_boxes)]
     is_object = name in task.objects
     contains = not np.isnan(known.floor)
     return Asset(
@@ -340,10 +330,8 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         low=low,
         high=high,
         grasps=(known.grasps or _by_the_sides(low, high)) if is_object else (),
-        articulations=MappingProxyType(
-            {region: replace(part, joint=f"{name}_{part.joint}") for region, part in known.parts}
-        ),
-        regions=MappingProxyType({full.removeprefix(f"{name}_"): full for full in regions}),
+        articulations={region: replace(part, joint=f"{name}_{part.joint}") for region, part in known.parts},
+        regions={full.removeprefix(f"{name}_"): full for full in regions},
         supports=known.floor if contains else high[2],
         clear_radius=known.clear if contains else 0.0,
         round=known.round,
@@ -355,10 +343,10 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
 def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
     """Return grasps between opposite sides of a box, the narrower first."""
     x, y, z = (np.add(low, high) / 2).tolist()
-    place = (x, y, max(z, high[2] - GRASP_DEPTH))
+    centre = (x, y, max(z, high[2] - GRASP_DEPTH))
     widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
     return tuple(
-        Grasp(place, yaw, widths[yaw])
+        Grasp(centre, yaw, widths[yaw])
         for yaw in sorted(widths, key=widths.__getitem__)
         if widths[yaw] <= MAX_GRASP_WIDTH
     )
@@ -379,12 +367,8 @@ def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tup
             half = np.abs(turn) @ model.geom_aabb[geom][3:]
             corners.append((middle - half, middle + half))
     lows, highs = zip(*corners, strict=True)
-    return _triple(np.min(lows, axis=0)), _triple(np.max(highs, axis=0))
-
-
-def _triple(values: Array) -> Triple:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    (x1, y1, z1), (x2, y2, z2) = np.min(lows, axis=0).tolist(), np.max(highs, axis=0).tolist()
+    return (x1, y1, z1), (x2, y2, z2)
 
 
 # --- detents ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import hashlib
 import reprlib
 import threading
 from collections import OrderedDict
@@ -21,7 +22,6 @@ from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
-from lerobot_memobench.sim.scene_hash import scene_hash
 from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -132,18 +132,10 @@ class Snapshot:
 
 
 class Simulation:
-    """Simulate the scene of one task at 20 Hz.
+    """Simulate the scene of one task at 20 Hz; the task's goal is not used.
 
     After `reset` and each `step`, positions, contacts and velocity-dependent terms in `data` match the present state.
     All queries are functions of `state()` and the fixtures' poses.
-
-    Args:
-        task: task that defines the scene; its goal is not used.
-        render: size and quality of frames.
-
-    Attributes:
-        settled: whether objects rest where they were placed, and nothing moves, after `reset`; False in some published
-            scenes, whose placements are LIBERO's.
     """
 
     def __init__(self, task: Task, render: RenderSettings | None = None) -> None:
@@ -162,7 +154,10 @@ class Simulation:
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
-        self.caught_at_home, self.settled = False, True
+        self.caught_at_home = False
+        """Whether the detent at home caught the hand in the last step."""
+        self.settled = True
+        """Whether objects rested where they were placed after `reset`. Some of LIBERO's placements do not."""
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
         self._drawn: tuple[mujoco.MjModel, mujoco.MjData] | None = None
@@ -200,7 +195,7 @@ class Simulation:
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
         for draw in range(MAX_SCENES):
-            self.settled = self._has_settled(self._set_up(seed, draw, settling, state))
+            self.settled = self._set_up(seed, draw, settling, state)
             if self.settled or not self._strict:
                 break
         else:
@@ -214,8 +209,8 @@ class Simulation:
 
     def _set_up(
         self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
-    ) -> dict[str, Array]:
-        """Return the objects' positions before the stabilisation steps."""
+    ) -> bool:
+        """Return whether objects rest where they were placed, and nothing moves."""
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[robot.ARM] = robot.ARM_START
         self.data.qpos[robot.FINGERS] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
@@ -224,10 +219,10 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
         if self._strict:
-            self._controller.gripper = np.array([1.0, -1.0])
+            self._controller.gripper = -robot.CLOSING_SIGNS  # the command of open fingers
         if state is not None:
             self.set_state(state)
-        places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
+        drawn_positions = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
         for step in range(STABILISATION_STEPS):
             if state is None:
                 self.step(NO_OP)
@@ -236,10 +231,7 @@ class Simulation:
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
-        return places
-
-    def _has_settled(self, places: dict[str, Array]) -> bool:
-        shifts = [self.data.body(name).xpos[:2] - place[:2] for name, place in places.items()]
+        shifts = [self.data.body(name).xpos[:2] - position[:2] for name, position in drawn_positions.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED
 
@@ -403,7 +395,10 @@ class Simulation:
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and the fixtures' poses."""
-        return scene_hash(self.state(), self.fixture_poses())
+        digest = hashlib.sha256(self.state().tobytes())
+        for name, pose in sorted(self.fixture_poses().items()):
+            digest.update(name.encode() + pose.tobytes())
+        return digest.hexdigest()[:16]
 
     # --- observation ----------------------------------------------------------------------------------------
 

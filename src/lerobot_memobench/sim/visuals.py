@@ -49,28 +49,27 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     Raises:
         ValueError: MuJoCo cannot read a file.
     """
-    seen = {geom.meshname for geom in spec.geoms if geom.group == VISUAL_GROUP}
+    drawn = {geom.meshname for geom in spec.geoms if geom.group == VISUAL_GROUP}
     for mesh in spec.meshes:
-        if mesh.name not in seen and mesh.file:
+        if mesh.name not in drawn and mesh.file:
             _use_placeholder(mesh)
     files = [(_key(part), part) for part in [*spec.meshes, *spec.textures] if part.file]
-    kept = {key: _read_cache(key) for key, _ in files}
-    missing = {key: part for key, part in files if kept[key] is None}
+    cached = {key: arrays for key, _ in files if (arrays := _read_cache(key)) is not None}
+    missing = {key: part for key, part in files if key not in cached}
     if missing:
-        whole = spec.copy().compile()
-        kept |= {key: _write_cache(key, _extract(whole, part)) for key, part in missing.items()}
-    meshes = {}
+        full_model = spec.copy().compile()
+        cached |= {key: _write_cache(key, _extract(full_model, part)) for key, part in missing.items()}
+    meshes, shapes = {}, {}
     for key, part in files:
-        arrays = kept[key]
-        assert arrays is not None
         if isinstance(part, mujoco.MjsMesh):
-            meshes[part.name] = arrays
+            meshes[part.name] = cached[key]
+            vertices = cached[key]["vertices"]
+            shapes[part.name] = vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], cached[key]["triangles"]
             _use_placeholder(part)
-        elif arrays["pixels"].size:
-            _replace(part, arrays["pixels"])
+        elif cached[key]["pixels"].size:
+            _replace(part, cached[key]["pixels"])
     model = spec.compile()
     _set_frames(model, meshes)
-    shapes = {name: _shape(arrays) for name, arrays in meshes.items()}
     return model, build_draw_list(model, shapes, (VISUAL_GROUP,), coarse=True)
 
 
@@ -78,7 +77,6 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
 
 
 def _key(part: mujoco.MjsMesh | mujoco.MjsTexture) -> str:
-    """Return the cache key of a mesh or texture, a hash of everything its content depends on."""
     names = MESH_SETTINGS if isinstance(part, mujoco.MjsMesh) else TEXTURE_SETTINGS
     settings = [np.asarray(getattr(part, name)).tolist() for name in names]
     facts = CACHE_FORMAT, mujoco.__version__, LAYER_SIZE, file_hash(Path(part.file)), settings
@@ -97,7 +95,6 @@ def _read_cache(key: str) -> Arrays | None:
 
 
 def _write_cache(key: str, arrays: Arrays) -> Arrays:
-    """Write arrays to the cache if it is writable, and return them."""
     record = np.empty(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
     for name, array in arrays.items():
         record[name] = array
@@ -147,8 +144,8 @@ def _thinned(shape: Triangles) -> Triangles:
     corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
     if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
         return shape
-    off = np.linalg.norm(spots - corners[moved], axis=1)
-    order = np.lexsort((-off, moved))  # the nearest vertex of each is written last
+    distance = np.linalg.norm(spots - corners[moved], axis=1)
+    order = np.lexsort((-distance, moved))  # the nearest vertex of each is written last
     nearest = np.zeros(len(corners), np.int64)
     nearest[moved[order]] = order
     flat = np.cross(corners[thin[:, 1]] - corners[thin[:, 0]], corners[thin[:, 2]] - corners[thin[:, 0]])
@@ -157,11 +154,6 @@ def _thinned(shape: Triangles) -> Triangles:
     edged = np.einsum("fcx,fx->fc", mean[thin], flat) < MIN_NORMAL_COSINE
     normal = np.where(edged[..., None], flat[:, None], mean[thin]).reshape(-1, 3)
     return corners[thin.ravel()], normal, spot_uv[nearest][thin.ravel()], np.arange(thin.size).reshape(-1, 3)
-
-
-def _shape(kept: Arrays) -> Triangles:
-    vertices = kept["vertices"]
-    return vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], kept["triangles"]
 
 
 # --- placeholders ---

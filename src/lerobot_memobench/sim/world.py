@@ -165,8 +165,8 @@ class World:
         """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
         if site < 0:
-            known = [self._model.site(i).name for i in range(self._model.nsite)]
-            raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, known)}")
+            regions = [self._model.site(i).name for i in range(self._model.nsite)]
+            raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, regions)}")
         data = self._data
         return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._model.site_size[site]
 
@@ -358,14 +358,14 @@ class HiddenObjects:
 
     def reveal(self, regions: Sequence[str]) -> list[str]:
         """Put absent objects into the drawers of ``regions``, with the drawers' velocities; return their names."""
-        found = [hidden for hidden in self.absent if hidden.region in regions]
-        self.absent = tuple(hidden for hidden in self.absent if hidden not in found)
-        for hidden in found:
+        revealed = [hidden for hidden in self.absent if hidden.region in regions]
+        self.absent = tuple(hidden for hidden in self.absent if hidden not in revealed)
+        for hidden in revealed:
             velocity = np.empty(6)  # angular part first
             site = self._data.site(hidden.region)
             mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_SITE, site.id, velocity, 0)
             self._write(hidden.name, np.concatenate([site.xpos + hidden.offset, hidden.quaternion]), velocity[3:])
-        return [hidden.name for hidden in found]
+        return [hidden.name for hidden in revealed]
 
     def _write(self, name: str, pose: Array, velocity: Array) -> None:
         joint = self._model.joint(int(self._model.body(name).jntadr[0]))

@@ -30,8 +30,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, OBJECT_TOKENS
 from lerobot_memobench.protocol import CAMERAS, OBS_PHASE
-from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.classes import AGENTVIEW_POSITION
+from lerobot_memobench.sim.asset import AGENTVIEW_POSITION, TABLE_TOP
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import standing_heights

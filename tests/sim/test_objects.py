@@ -1,4 +1,4 @@
-"""A user's own folder of objects: the guide's example runs, and files that cannot be used are errors."""
+"""Files of objects: LIBERO's, this package's, scans, and a user's own folder, by the example of its guide."""
 
 from __future__ import annotations
 
@@ -17,9 +17,113 @@ from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import files, mjcf
-from lerobot_memobench.sim.scene import get_scene
+from lerobot_memobench.sim.robot import SUBSTEPS
+from lerobot_memobench.sim.scene import get_scene, scene_spec
+from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.sim.visuals import drawing_model
-from lerobot_memobench.tasks.catalogue import load_task
+from lerobot_memobench.tasks.catalogue import get_task, load_task
+from tests.sim.conftest import DRAWER
+
+CLASSES = sorted(folder.name for folder in files.OWN_OBJECTS.iterdir())
+
+
+def test_files_are_small() -> None:
+    assert sum(path.stat().st_size for path in files.OWN_OBJECTS.glob("*/*")) <= 500_000
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_each_class_has_one_contact_box_of_its_size(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
+    known = mjcf.class_file(name, "published")
+    (box,) = (geom for geom in known.body.iter("geom") if not mjcf.is_visual(geom))
+    x, y, z = mjcf.parse_numbers(box.attrib["size"])
+    assert (known.radius, known.bottom, known.top) == (max(x, y), -z, z)
+    assert all(Path(one.attrib["file"]).is_file() for one in known.assets() if "file" in one.attrib)
+    assert known.stand_in
+
+
+def test_strict_tasks_ignore_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    assert not mjcf.class_file("artichoke", "strict").stand_in
+
+
+def test_visual_geoms_change_no_motion() -> None:
+    """The simulated model has none."""
+    sim = Simulation(get_task(DRAWER))
+    sim.reset(7)
+    ends = []
+    for visuals in (False, True):
+        model = scene_spec(sim.task, visuals).compile()
+        model.body_pos[:], model.body_quat[:] = sim.model.body_pos, sim.model.body_quat
+        data, rng = mujoco.MjData(model), np.random.default_rng(0)
+        data.qpos[:] = sim.data.qpos
+        for _ in range(50):
+            data.ctrl[:] = rng.uniform(*model.actuator_ctrlrange.T) / 4
+            mujoco.mj_step(model, data, SUBSTEPS)
+        ends.append(np.concatenate([data.qpos, data.qvel]))
+    assert np.abs(ends[0][: sim.model.nq] - sim.data.qpos).max() > 0.1
+    np.testing.assert_array_equal(*ends)
+
+
+# --- LIBERO's files and scans ---
+
+
+def test_required_packages_have_all_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = dict(files._candidates())
+    folder = places[f"the packages {files.DISTRIBUTIONS}"]
+    assert files._verified(folder) == {name: folder / name for name in files.known_hashes()}
+
+
+def scan_folder(folder: Path, category: str, names: tuple[str, ...]) -> Path:
+    """Write scans of a category in the layout of the authors' folder."""
+    for height, name in enumerate(names, start=1):
+        path = folder / category / name / "usd" / "MJCF"
+        (path / "visuals").mkdir(parents=True)
+        corners = [(x, y, z * 0.01 * height) for x in (-0.02, 0.02) for y in (-0.03, 0.03) for z in (-1, 1)]
+        quads = ("1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6")
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {quad}" for quad in quads]
+        (path / "visuals" / "model.obj").write_text("\n".join(lines))
+        (path / f"{name}.xml").write_text(
+            f'<mujoco model="{name}"><asset><mesh name="model" file="visuals/model.obj"/></asset>'
+            f'<worldbody><body name="object"><geom class="visual" type="mesh" mesh="model"/>'
+            '<geom class="touched" type="mesh" mesh="model"/></body></worldbody>'
+            '<default><default class="visual"><geom group="1" contype="0" conaffinity="0"/></default>'
+            '<default class="touched"><geom group="0" condim="4"/></default></default></mujoco>'
+        )
+    return folder
+
+
+def test_user_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    task = get_task(DRAWER)
+    monkeypatch.delenv(files.SCANS_VARIABLE, raising=False)
+    assert get_scene(task).stand_ins == ("beefsteak_tomato__1", "box_of_oatmeal__3")
+    scan_folder(tmp_path, "beefsteak_tomato", ("aaa", "bbb"))
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="no folder 'box_of_oatmeal'"):
+        get_scene(task)
+    scan_folder(tmp_path, "box_of_oatmeal", ("a", "b", "c", "d"))
+    scene = get_scene(task)
+    assert scene.stand_ins == ()
+    tomato = "beefsteak_tomato__1_1"
+    (touched,) = (scene.model.geom_bodyid == scene.model.body(tomato).id).nonzero()[0]
+    assert scene.model.geom_condim[touched] == 4
+    assert scene.assets[tomato].high == pytest.approx((0.02, 0.03, 0.02))  # the second scan
+    assert mjcf.class_file("beefsteak_tomato__1", "published").bottom == pytest.approx(-0.02)
+    with pytest.raises(MemobenchError, match="2 scans"):
+        mjcf.class_file("beefsteak_tomato__2", "published")
+
+
+def test_scan_references_outside_its_folder_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scan_folder(tmp_path, "biscuit", ("a",))
+    path = tmp_path / "biscuit/a/usd/MJCF/a.xml"
+    (path.parent.parent / "outside.obj").write_text("v 0 0 0\n")
+    path.write_text(path.read_text().replace('file="visuals/model.obj"', 'file="../outside.obj"'))
+    monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
+    with pytest.raises(MemobenchError, match="which is not in its folder"):
+        mjcf.class_file("biscuit", "published").assets()
+
+
+# --- the user's objects ---
 
 PAGE = Path(__file__).parents[2] / "docs/develop/add_an_object_class.md"
 BLOCK = re.compile(r'^```(\w+)(?: title="([^"\n]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
