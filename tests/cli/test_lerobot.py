@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from operator import attrgetter
@@ -111,14 +110,6 @@ def test_help_explains_every_short_form(
     words = {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")}
     assert words - (of_env - {"tasks=", "obs_type="} if command == "train" else set()) <= explained
     assert not any(len(line) > 106 for line in text.splitlines())
-
-
-def test_the_installed_program(tmp_path: Path) -> None:
-    program = Path(sys.executable).with_name("lerobot")
-    done = subprocess.run([program, "evaluate"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "'eval'" in done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 # --- eval ---
