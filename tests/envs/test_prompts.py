@@ -125,10 +125,6 @@ def test_rollouts_are_equal_without_cache_while_writing_and_restored(
             assert [part for part in wanted if frame[part] != wanted[part]] == [], k
     if longest is None:
         assert line["prompt_shown"]
-    frames, found = rollout(name, seed, tmp_path / "reset", RESET, obs_type)
-    assert found == line
-    for frame, wanted in zip(frames, expected[line["prompt_steps"] :], strict=True):
-        assert [part for part in wanted if frame[part] != wanted[part] and part != "outcome"] == []
     assert len([*folder.iterdir()]) == 1
 
 
