@@ -109,8 +109,7 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     Links to folders are followed. Each folder is read once, so links in a circle end.
 
     Raises:
-        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader; or a
-            folder cannot be read.
+        MemobenchError: one of them is a pipe, a device or a broken link; or a folder cannot be read.
     """
 
     def refuse(error: OSError) -> None:
@@ -159,7 +158,7 @@ def cache_base() -> Path:
 def choose_caches() -> None:
     """Set variables of the environment for a user without a name or a writable home, as in many containers.
 
-    Call it before numba, torch or Hugging Face is imported. Child processes inherit the variables.
+    Call it before numba, torch or Hugging Face is imported.
     """
     if sys.platform == "win32":
         return
@@ -361,8 +360,7 @@ def file_bytes(path: Path) -> bytes:
     """Return the content of a file, or of the same file compressed by ``gzip`` if only that exists.
 
     Raises:
-        FileNotFoundError: neither exists.
-        OSError: it cannot be read, is damaged, or is too large unpacked.
+        OSError: neither exists, it cannot be read, is damaged, or is too large unpacked.
         MemobenchError: it is a Git LFS pointer.
     """
     if path.suffix != PACKED and not path.exists() and packed(path).exists():

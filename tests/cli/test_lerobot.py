@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from operator import attrgetter
@@ -103,14 +102,6 @@ def test_help_explains_every_short_form(
     words = {f"{word}=" for word in (*SHORT_FORMS[command], *OPTIONS[command], "policy")}
     assert words - (of_env - {"tasks=", "obs_type="} if command == "train" else set()) <= explained
     assert not any(len(line) > 106 for line in text.splitlines())
-
-
-def test_the_installed_program(tmp_path: Path) -> None:
-    program = Path(sys.executable).with_name("lerobot")
-    done = subprocess.run([program, "evaluate"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "'eval'" in done.stderr
-    assert not list(tmp_path.iterdir())
 
 
 # --- eval ---
@@ -232,9 +223,6 @@ def leave(folder: Path, outside: str = "../elsewhere.safetensors") -> None:
         (lambda folder: (folder / "stats.safetensors").write_bytes(b"x"), "stats.safetensors"),
         (lambda folder: save_file({"action.mean": np.zeros(1)}, folder / "stats.safetensors"), "observation.state"),
         (lambda folder: (folder / "policy_preprocessor.json").unlink(), "policy_preprocessor.json"),
-        (lambda folder: (folder / "policy_preprocessor.json").write_text("{"), "is not JSON"),
-        (lambda folder: (folder / "model.safetensors").unlink(), "model.safetensors"),
-        (lambda folder: (folder / "config.json").write_text("{}"), "policy type"),
         (leave, "names no file"),
     ],
 )
@@ -353,9 +341,7 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["policy=memobench_mem", "policy.memory=recurrent", "policy.memory_settings={length: 4}"], "'length'"),
         ([*SMALL, "align=none", "policy.memory=none", "policy.memory_phase=true"], "memory_phase=True"),
         (["policy=act", "dataset=stuff"], "meta/info.json"),
-        (["policy=act", "--dataset.repo_id=local/stuff", "--dataset.root=stuff"], "meta/info.json"),
         (["policy=act", "dataset=missing"], "memobench generate"),
-        (["policy=act", "--dataset.repo_id=outputs/missing"], "outputs/missing"),
         (["policy=act", "device=cuda:99"], "cuda:99"),
         (["resume=true"], "output_dir="),
         (["resume=true", "output_dir=nowhere"], "nowhere does not exist"),
@@ -368,7 +354,6 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["resume=true", "output_dir=run", "--policy.ema_decay=0"], "ema_decay=0.999"),
         (["resume=true", "output_dir=run", "optimizer.lr=0.5"], "optimizer.lr=0.001"),
         (["resume=true", "output_dir=run", "dataset=mine"], "dataset a/b"),
-        (["resume=true", "output_dir=run", "--dataset.repo_id=c/d"], "dataset a/b"),
         (["resume=true", "output_dir=run", "episodes=[0, 1]"], "dataset.episodes=None"),
         (
             ["config_path=run/checkpoints/last/pretrained_model/train_config.json", "align=semantic", "--resume"],

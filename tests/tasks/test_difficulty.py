@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import differences, episode_record, write_episodes
+from lerobot_memobench.envs.episode_log import episode_record, write_episodes
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.agreement import outcome
@@ -68,13 +68,6 @@ def test_a_difficulty_is_for_strict_tasks_and_known() -> None:
         EnvSettings(difficulty="hard")
     with pytest.raises(MemobenchError, match="easy"):
         EnvSettings(suite=STRICT, difficulty="esay")
-
-
-def test_evaluations_of_two_difficulties_differ_and_earlier_protocols_are_standard() -> None:
-    hard, standard = (EnvSettings(suite=STRICT, difficulty=each).protocol_block for each in ("hard", STANDARD))
-    assert {each.split(":")[0] for each in differences(hard, standard)} == {"difficulty", "horizon"}
-    earlier = {name: value for name, value in standard.items() if name != "difficulty"}
-    assert differences(earlier, standard) == []
 
 
 def test_a_log_of_a_difficulty_is_checked_and_described_as_such(tmp_path: Path) -> None:

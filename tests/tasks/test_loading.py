@@ -281,6 +281,3 @@ def refusal(folder: Path) -> str:
     except MemobenchError as error:
         return str(error)
     return ""
-
-
-# --- worlds and memory texts ---

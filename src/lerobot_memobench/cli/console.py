@@ -98,8 +98,7 @@ class Count:
         """Show that ``done`` of ``total`` pieces of work are done.
 
         Args:
-            what: name of the newest piece; "" prints no line.
-            trouble: its failure, printed on a terminal as well.
+            what: name of the newest piece; "" prints no line. trouble: its failure, printed on a terminal as well.
             found: pieces that an earlier run has done; they are left out of the speed.
         """
         if done <= found:

@@ -353,11 +353,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side, under instruction and checkpoints; see `Observer.frame`.
-
-        Raises:
-            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
-        """
+        """Return both cameras side by side, under instruction and checkpoints; see `Observer.frame`."""
         self._check_began("render")
         return self._observer.frame(self._shown) if self._not_run is None else _black(self.settings)
 

@@ -103,7 +103,6 @@ class Episode:
         """Start the episode of a seed. The episode is a function of task, settings, seed and actions.
 
         Args:
-            seed: seed of the scene.
             variant: variant to run instead of the drawn one (evidence); `choice` then follows the policy's choice.
             keep_prompt: whether the prompt is cached (`prompts`).
         """
@@ -232,10 +231,7 @@ class Episode:
 
     @property
     def clock(self) -> int:
-        """Value of ``step`` in observations: control steps since the phase began.
-
-        In the execution of a strict task: `NO_CLOCK`, and `ENDED` once it has ended.
-        """
+        """Value of ``step`` in observations: steps since the phase began; in a strict execution `NO_CLOCK`, `ENDED`."""
         if self.phase == PROMPT:
             return self.step_index
         if self.task.suite == STRICT:

@@ -43,12 +43,12 @@ class Pacing:
         self._rng = rng
         self._actions: list[NDArray[np.float32]] = []  # of the current chunk
         self._step = 0  # within the current chunk
-        self._until_pause = self._gap()  # execution steps
+        self._until_pause = self._pause_interval()  # execution steps
         self._rests = self._held = 0  # remaining steps of this pause, of this hold
         self.paused_steps = self.held_steps = 0
         self._shortest_hold = shortest_hold(settings)
 
-    def _gap(self) -> int:
+    def _pause_interval(self) -> int:
         return int(self._rng.integers(*STEPS_BETWEEN_PAUSES, endpoint=True)) if self.pauses else 0
 
     @property
@@ -59,6 +59,7 @@ class Pacing:
     def hold(self, steps: int) -> None:
         """Hold the scene for at least ``steps`` control steps, longer than a plan, until a chunk begins."""
         steps = max(steps, self._shortest_hold)
+        # Round up, so that the hold ends where a chunk of the policy ends; the interrupted chunk is dropped.
         self._held = steps + -(self._step + steps) % (self._chunk * self._stretch)
         self._actions, self._step = [], 0
 
@@ -81,7 +82,7 @@ class Pacing:
         if self._step == self._chunk * self._stretch:
             self._actions, self._step = [], 0
             if self.pauses and self._until_pause <= 0:
-                self._rests, self._until_pause = self._pause, self._gap()
+                self._rests, self._until_pause = self._pause, self._pause_interval()
         return slowed
 
 

@@ -5,8 +5,7 @@ LeRobot's own videos keep all frames of ten episodes in memory and omit the last
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, explaining_disk_errors
 from lerobot_memobench.protocol import CONTROL_HZ, PROMPT
 
 if TYPE_CHECKING:
@@ -140,7 +138,7 @@ class VideoRecorder:
         if self._last is not None and frame.shape[:2] != (self._last.height, self._last.width):
             raise ValueError(f"a frame of shape {frame.shape} follows one of {self._last.height} × {self._last.width}")
         self._last = VideoFrame.from_ndarray(frame, format="rgb24")
-        with self._refusing():
+        with explaining_disk_errors(self._path, "or set videos=0"):
             if self._container is None:
                 self._open(*frame.shape[:2])
             self._encode(self._last)
@@ -149,7 +147,7 @@ class VideoRecorder:
         """Repeat the last frame and complete the file; return its path, None without frames."""
         if self._last is None:
             return None
-        with self._refusing():
+        with explaining_disk_errors(self._path, "or set videos=0"):
             for _ in range(LAST_FRAMES):
                 self._last.pts = None  # the encoder numbers it
                 self._encode(self._last)
@@ -167,19 +165,6 @@ class VideoRecorder:
                     self._container.close()
                 self._container = None
             raise _DiscardedError
-
-    @contextmanager
-    def _refusing(self) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            reason = getattr(error, "strerror", None)  # of the system or FFmpeg
-            if reason is None:
-                raise
-            raise MemobenchError(
-                f"the video {self._path} cannot be written ({reason}); free disk space, choose another output_dir=, or "
-                "set videos=0"
-            ) from error
 
     def _open(self, height: int, width: int) -> None:
         import av

@@ -196,7 +196,7 @@ def _parse(text: str, path: str) -> _Node:
         last = match.start()
         node = _Node(path, line, match.start(), match.end(), match.group())
         if node.word == ")":
-            if len(stack) == 1:
+            if len(stack) == 1:  # the root is no list of the file
                 raise node.error("an unmatched ')'", "'(' before it or the end of the file")
             stack.pop().end = match.end()
             continue

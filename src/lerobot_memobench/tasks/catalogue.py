@@ -150,7 +150,7 @@ def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
     """
     known = task_names(suite=suite)
     text = spec
-    for name in (name for name in _entries() if "," in name):
+    for name in (name for name in _entries() if "," in name):  # its commas separate nothing
         text = text.replace(name, name.replace(",", "\0"))
     words = [word.replace("\0", ",").strip() for word in text.split(",")]
     if len(words) > 1 and "all" in words:
@@ -300,7 +300,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         MemobenchError: with file, place, the value found and the value expected.
     """
     folder = Path(folder).resolve()
-    if folder.parent.parent == LIBERO_FOLDER.resolve():
+    if folder.parent.parent == LIBERO_FOLDER.resolve():  # a place in an archive, see `task_folder`
         return get_libero_task(folder.name)
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
