@@ -321,7 +321,6 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
 
 
 def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
-    """Return the simulator's states, for replay; their width differs between tasks."""
     import pyarrow as pa
 
     length, width = states.shape
@@ -355,7 +354,7 @@ class ParquetFiles:
         self._writer.write_table(table)
 
     def size(self) -> int:
-        """Return the present size of the current file, bytes."""
+        """Return the bytes of the current file."""
         return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:

@@ -20,7 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.episodes import read_info
+from lerobot_memobench.datasets.episodes import list_episodes, read_info
 from lerobot_memobench.datasets.frames import (
     Encoded,
     FrameLookup,
@@ -30,7 +30,7 @@ from lerobot_memobench.datasets.frames import (
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.layout import without_pattern
+from lerobot_memobench.datasets.layout import EPISODE_INFO, without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
@@ -115,7 +115,7 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
 
     Raises:
-        MemobenchError: the dataset lacks an episode, or an earlier version made it.
+        MemobenchError: the dataset lacks an episode, or another version made it.
     """
     opened = copy.copy(config)
     if config.dataset.root is not None:
@@ -125,6 +125,8 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     check_episodes(given.episodes, meta)
     complete_statistics(config.policy, meta, given)
     train, held_out = make_train_eval_datasets(opened)
+    if EPISODE_INFO in train.meta.features:
+        list_episodes(Path(train.meta.root))  # refuses records that another version of this package wrote
     return train, held_out
 
 
