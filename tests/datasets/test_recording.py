@@ -116,13 +116,12 @@ import json
 import sys
 from pathlib import Path
 from lerobot_memobench.datasets.record import RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.stage import staged
 from lerobot_memobench.tasks.catalogue import get_task
 
 task, seed, settings, folder = sys.argv[1:]
 job = RecordingJob(get_task(task), int(seed), RecordingSettings(images=False, **json.loads(settings)), Path(folder))
 job.run()
-made = staged(job)
+made = job.episode()
 print(made.failure or made.info["digest"])
 """
 

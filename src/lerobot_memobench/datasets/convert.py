@@ -44,7 +44,6 @@ from lerobot_memobench.datasets.stage import (
     episodes_folder,
     finished_manifest,
     stage_failure,
-    staged,
 )
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -142,7 +141,7 @@ def convert(
         for number, file in enumerate(files, 1):
             conversion.add(number, file)
         problems, notes = [*conversion.problems, *problems], conversion.notes
-        episodes = [episode for episode in map(staged, conversion.jobs) if episode.failure is None]
+        episodes = [job.episode() for job in conversion.jobs if job.failure() is None]
         if episodes:
             made_by = (
                 f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; columns that "

@@ -24,7 +24,6 @@ from lerobot_memobench.datasets.stage import (
     check_destination,
     episodes_folder,
     finished_manifest,
-    staged,
 )
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -198,7 +197,7 @@ def _assembled(
     plan: _Plan, jobs: Sequence[RecordingJob], out: Path, request: Mapping[str, Any], made_by: str
 ) -> GenerationSummary:
     """Assemble the dataset of finished jobs, if one of them has an episode, and remove the staging folder."""
-    episodes = [staged(job) for job in jobs]
+    episodes = [job.episode() for job in jobs]
     summary = _summary([{**episode.info, "failure": episode.failure} for episode in episodes], plan, out)
     if summary.folder is not None:
         assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest={"request": request})

@@ -139,17 +139,16 @@ class StagedJob:
         """Return whether ``folder`` holds the episode, or the reason of its failure."""
         return read_staged(self.folder) is not None
 
+    def episode(self) -> StagedEpisode:
+        """Return the episode of a finished job."""
+        episode = read_staged(self.folder)
+        if episode is None:
+            raise MemobenchError(f"{self.folder} was removed during the run; run the command again")
+        return episode
+
     def failure(self) -> str | None:
         """Return why a finished job has no episode, or None."""
-        return staged(self).failure
-
-
-def staged(job: StagedJob) -> StagedEpisode:
-    """Return the finished episode of a job that was run."""
-    episode = read_staged(job.folder)
-    if episode is None:
-        raise MemobenchError(f"{job.folder} was removed during the run; run the command again")
-    return episode
+        return self.episode().failure
 
 
 # --- writing an episode ---
