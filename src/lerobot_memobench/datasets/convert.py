@@ -312,13 +312,7 @@ def inspect(file: SourceFile) -> Findings:
 
 @dataclass
 class _Conversion:
-    """Stage the episodes of one file after another.
-
-    Attributes:
-        jobs: one per demonstration that can be converted, all of them run.
-        problems, notes: of the files so far, in their order.
-        resumed: number of episodes that an earlier run had made.
-    """
+    """Stage the episodes of one file after another; ``resumed`` counts those that an earlier run had made."""
 
     source: Path
     staging: Path

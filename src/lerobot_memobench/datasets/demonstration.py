@@ -303,7 +303,7 @@ def digest(demo: Demonstration) -> str:
     not. Visible objects and the labels of `NOT_HASHED` are determined by the other columns too; hashing them would
     change the hashes of earlier datasets.
     """
-    found = labels(demo)
+    frame_labels = labels(demo)
     identity = {
         "task": demo.task.name,
         "seed": demo.seed,
@@ -316,9 +316,9 @@ def digest(demo: Demonstration) -> str:
     columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    if found.held.any():  # an added column changes no hash of demonstrations without holds
-        columns["held"] = found.held
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
+    if frame_labels.held.any():  # an added column changes no hash of demonstrations without holds
+        columns["held"] = frame_labels.held
+    columns |= {f.name: getattr(frame_labels, f.name) for f in fields(Labels) if f.name not in NOT_HASHED}
     # The hash is independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):

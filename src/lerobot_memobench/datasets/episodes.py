@@ -332,11 +332,7 @@ class ListedEpisode:
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:
-    """Return a dataset's episodes with their records, in order.
-
-    Raises:
-        MemobenchError: the folder is no dataset, or a record in it is damaged.
-    """
+    """Return a dataset's episodes with their records, in order."""
     read_info(folder)
     rows = _rows(folder)
     own = ("episode_index", EPISODE_INFO)
@@ -395,11 +391,7 @@ class RecordedEpisode:
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
-    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``.
-
-    Raises:
-        MemobenchError: there is no dataset or no such episode, or another program made it.
-    """
+    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``."""
     root = Path(root)
     read_info(root)
     rows = _rows(root, episode_index)
@@ -426,9 +418,11 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
 def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[str | None], length: int) -> None:
     in_meta = from_meta(row)
     for key in DemonstrationRecord.model_fields if in_meta is not None else ():
-        here, there = getattr(record, key), getattr(in_meta, key)
-        if key != "versions" and here != there:
-            raise MemobenchError(f"meta/episodes has {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
+        of_frames, of_meta = getattr(record, key), getattr(in_meta, key)
+        if key != "versions" and of_frames != of_meta:
+            raise MemobenchError(
+                f"meta/episodes has {key}={of_meta!r}, the frames' column {EPISODE_INFO} {of_frames!r}"
+            )
     again = next((frame for frame, text in enumerate(texts) if frame and text), None)
     if again is not None:
         raise MemobenchError(

@@ -122,8 +122,6 @@ def generate(
 
 @dataclass(frozen=True)
 class _Plan:
-    """Episodes that a run has to make, and its settings."""
-
     tasks: tuple[Task, ...]
     episodes: int
     prompted_episodes: int | None
@@ -217,9 +215,8 @@ def task_hash(task: Task) -> str:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions on which an episode's numbers depend."""
     versions = {}
-    for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):
+    for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):  # an episode's numbers depend on them
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
@@ -305,7 +302,6 @@ class GenerationSummary:
 
 
 def _summary(rows: Sequence[dict[str, Any]], plan: _Plan, out: Path) -> GenerationSummary:
-    """Return the outcome of a run from the rows of its manifest."""
     episodes = tuple(EpisodeOutcome(row["task_name"], row["seed"], row["frames"], row["failure"]) for row in rows)
     made = any(episode.failure is None for episode in episodes)
     return GenerationSummary(out if made else None, tuple(task.name for task in plan.tasks), episodes)

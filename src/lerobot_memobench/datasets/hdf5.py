@@ -285,7 +285,6 @@ def _json_object(text: str, name: str) -> dict[str, Any]:
 
 
 def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
-    """Return an array of one of the types; None in ``shape`` accepts any length."""
     import h5py
 
     array = group.get(name)

@@ -56,8 +56,7 @@ UNKNOWN = "tasks"
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
-    Raises:
-        Unusable: the group contradicts itself or the task, or is of another scene than the task's.
+    `Unusable` if the group contradicts itself or the task, or is of another scene than the task's.
     """
     sim = _simulation(task)
     states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
@@ -116,7 +115,6 @@ def _execution_start(task: Task, demo: PublishedDemo) -> int:
 
 
 def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
-    """Return the checked ``key_frame``, one per checkpoint, -1 where unknown."""
     frames = demo.metadata.get("key_frame", [-1] * len(task.checkpoints))
     if (
         not isinstance(frames, list)
@@ -184,7 +182,7 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
-    """Return a task's simulation; the last one is cached, because a file's demonstrations follow each other."""
+    # The last one is cached, because a file's demonstrations follow each other.
     try:
         sim = Simulation(task)
     except MemobenchError as error:
@@ -295,7 +293,6 @@ def compile_scene(text: str) -> mujoco.MjModel:
 
 
 def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> None:
-    """Copy bodies and joints, with the attributes of `KEPT`."""
     for element in source:
         tag, name = element.tag, element.get("name", "")
         if tag in LEFT_OUT:

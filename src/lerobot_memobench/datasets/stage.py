@@ -80,7 +80,7 @@ class StagedEpisode:
 
     @property
     def failure(self) -> str | None:
-        """Why there is no demonstration of this seed, or None."""
+        """See `EpisodeFile`."""
         return self.content.failure
 
     @property

@@ -71,13 +71,7 @@ NO_HASHES = (
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Outcome of the check of an episode or a file.
-
-    Attributes:
-        subject: ``episode 3``, or a file.
-        disagreement: the first disagreement, None if everything agrees.
-        note: remark on a file that agrees.
-    """
+    """First disagreement of an episode or a file, None if everything agrees, and a note on a file that agrees."""
 
     subject: str
     disagreement: str | None
@@ -87,10 +81,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class _Check:
-    """A check of an episode, of a file, or of its agreement with others; runs in any process.
-
-    ``check`` returns a disagreement of an episode, or a note on a file, or None, and raises for damage.
-    """
+    """A check, which returns a disagreement of an episode, or a note on a file, or None, and raises for damage."""
 
     subject: str
     path: Path

@@ -232,7 +232,6 @@ def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> Fram
 
 
 def _decoder() -> Callable[[Path, list[float]], Tensor]:
-    """Return a function from a video and times in it, s, to its frames."""
     from lerobot.datasets import video_utils
 
     backend = video_utils.get_safe_default_video_backend()
