@@ -103,7 +103,7 @@ def as_recorded(demo: Demonstration) -> RecordedEpisode:
     """Return a demonstration as `read_episode` would read it."""
     columns, record = labels(demo), DemonstrationRecord.of(demo)
     frames = {"states": demo.states, "observation.state": demo.proprio, OBJECTS: demo.objects}
-    frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns.columns()}
+    frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns}
     return RecordedEpisode(record, frames, record.determined() | {LANGUAGE: persistent_rows(columns)}, 0)
 
 

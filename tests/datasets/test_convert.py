@@ -291,8 +291,8 @@ def test_foreign_files_without_key_frames(stove, tmp_path):
     assert (restored.seed, restored.success) == (-1, True)
     np.testing.assert_array_equal(restored.states, stove.states)
     np.testing.assert_array_equal(restored.proprio, stove.proprio)
-    for name, column in labels(stove).columns().items():
-        assert np.array_equal(labels(restored).columns()[name], column), name
+    for name, column in labels(stove).items():
+        assert np.array_equal(labels(restored)[name], column), name
 
 
 @pytest.mark.slow

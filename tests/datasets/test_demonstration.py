@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.demonstration import digest, labels, persistent_rows
+from lerobot_memobench.datasets.demonstration import digest, key_frames, labels, persistent_rows
 from lerobot_memobench.errors import MemobenchError
 
 
@@ -17,28 +17,30 @@ def bits(values) -> str:
 
 def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
-    assert found.simple_subgoal == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
-    assert found.grounded_subgoal[2] == "did thing 1 with the left hand"
-    assert found.coarse_subgoal == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last text remains"
-    assert found.operation.tolist() == [0, 0, 1, 2, -1], "none is left"
+    assert found["subgoal.intermediate"] == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
+    assert found["subgoal.fine"][2] == "did thing 1 with the left hand"
+    assert found["subgoal.coarse"] == ["coarse 0"] * 2 + ["coarse 1"] + ["coarse 2"] * 2, "the last text remains"
+    assert found["checkpoint.operation"].tolist() == [0, 0, 1, 2, -1], "none is left"
     done = ["did thing 0", "did thing 0; did thing 1", "did thing 0; did thing 1; did thing 2"]
-    assert found.memory == ["", "", *done]
+    assert found["oracle_memory"] == ["", "", *done]
 
 
 def test_prompt_frames(make_demo):
-    found = labels(make_demo(["000001", "000000"], exec_start=3))
-    assert bits(found.phase) == "000111"
-    assert found.step.tolist() == [0, 1, 2, 0, 1, 2]
-    assert set(found.memory) == {""}
-    assert found.key_frames.tolist() == [5, -1]  # frames of the episode, prompt included
+    demo = make_demo(["000001", "000000"], exec_start=3)
+    found = labels(demo)
+    assert bits(found["observation.phase"]) == "000111"
+    assert found["observation.step"].tolist() == [0, 1, 2, 0, 1, 2]
+    assert set(found["oracle_memory"]) == {""}
+    assert key_frames(demo).tolist() == [5, -1]  # frames of the episode, prompt included
 
 
 def test_number_of_checkpoints(make_demo, make_task):
     demo = make_demo(["000"], task=make_task("S"))
-    found = labels(replace(demo, task=make_task(""), satisfied=np.zeros((3, 0), dtype=np.bool_)))
-    assert found.operation.tolist() == [-1] * 3
-    assert found.simple_subgoal == [demo.task.language] * 3
-    assert found.key_frames.shape == (0,)
+    none = replace(demo, task=make_task(""), satisfied=np.zeros((3, 0), dtype=np.bool_))
+    found = labels(none)
+    assert found["checkpoint.operation"].tolist() == [-1] * 3
+    assert found["subgoal.intermediate"] == [demo.task.language] * 3
+    assert key_frames(none).shape == (0,)
     with pytest.raises(MemobenchError, match="7 checkpoints"):
         labels(make_demo(["0"] * 7, task=make_task("SSSSSSS")))
 
@@ -50,16 +52,17 @@ def test_labels_equal_a_plain_simulation_of_the_definition(make_demo):
         start = int(rng.integers(0, length))
         table = rng.random((count, length)) < 0.2
         table[:, :start] = False
-        found = labels(make_demo(["".join(map(str, row.astype(int))) for row in table], exec_start=start))
+        demo = make_demo(["".join(map(str, row.astype(int))) for row in table], exec_start=start)
+        found, completion = labels(demo), key_frames(demo)
         index, seen = 0, set()
         for t in range(length):
-            assert found.index[t] == index
+            assert found["checkpoint.index"][t] == index
             new = {k for k in range(count) if table[k, t]} - seen
-            assert found.event[t] == bool(new)
+            assert found["checkpoint.event"][t] == bool(new)
             seen |= new
-            assert set(np.flatnonzero(found.completed[t])) == seen
+            assert set(np.flatnonzero(found["checkpoint.completed"][t])) == seen
             while index < count and table[index, t]:
-                assert found.key_frames[index] == t
+                assert completion[index] == t
                 index += 1
 
 

@@ -20,7 +20,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames
 from lerobot_memobench.datasets.layout import (
     ADVICE,
     EPISODE_INFO,
@@ -203,7 +203,7 @@ class DemonstrationRecord(BaseModel):
             variant=int(demo.variant),
             success=bool(demo.success),
             exec_start_index=int(demo.exec_start),
-            key_frames=labels(demo).key_frames.tolist(),
+            key_frames=key_frames(demo).tolist(),
             scene_hash=demo.scene_hash,
             fixture_poses={name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
             digest=digest(demo),

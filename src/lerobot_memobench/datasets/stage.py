@@ -196,7 +196,7 @@ class EpisodeStage:
         columns = labels(demo)
         record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
         info = record | {"language": demo.task.language, "frames": len(demo)}
-        _check_storable(info, columns.columns())
+        _check_storable(info, columns)
         for video in self._videos.values():
             video.close()
         stats = {
@@ -209,7 +209,7 @@ class EpisodeStage:
             "proprio": demo.proprio,
             "objects": demo.objects,
             **({} if demo.executed is None else {"executed": demo.executed}),
-            **columns.columns(),
+            **columns,
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
         return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)

@@ -353,7 +353,7 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
         "states": again.states,
         "observation.state": again.proprio,
         objects_column(columns): again.objects,
-        **columns_again.columns(),
+        **columns_again,
     }
     return _first_difference(columns, replayed) or image_check.difference or of_episode
 
