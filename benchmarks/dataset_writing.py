@@ -122,7 +122,7 @@ def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.nda
     features = {key: value for key, value in dataset_features((256, 256)).items() if key not in omitted}
     dataset = LeRobotDataset.create("local/plain", fps=CONTROL_HZ, features=features, root=out, use_videos=True)
     for demo, images_of_steps in episodes:
-        columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}
+        columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo)}
         for t, images in enumerate(images_of_steps):
             frame: dict[str, Any] = {image_key(camera): image for camera, image in images.items()}
             for key, column in columns.items():

@@ -50,24 +50,13 @@ def make_task() -> MakeTask:
             )
             for k, operation in enumerate(operations)
         )
-        return Task(
+        return replace(
+            get_task(STOVE),
             name=name,
             memory_type=memory_type,  # type: ignore[arg-type]
             family="synthetic",
             language=f"do the {name.replace('_', ' ')}",
-            objects={},
-            fixtures={},
-            regions={},
-            init=(),
-            objects_of_interest=(),
-            goal=Atom("open", ("drawer_0",)),
             checkpoints=checkpoints,
-            prompt=None,
-            variants=(),
-            demo_summary="",
-            folder=Path(name),
-            bddl_text=name,
-            metadata={},
         )
 
     return make
@@ -114,7 +103,7 @@ def as_recorded(demo: Demonstration) -> RecordedEpisode:
     """Return a demonstration as `read_episode` would read it."""
     columns, record = labels(demo), DemonstrationRecord.of(demo)
     frames = {"states": demo.states, "observation.state": demo.proprio, OBJECTS: demo.objects}
-    frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns.columns()}
+    frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns}
     return RecordedEpisode(record, frames, record.determined() | {LANGUAGE: persistent_rows(columns)}, 0)
 
 

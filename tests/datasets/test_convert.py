@@ -71,11 +71,6 @@ def converted(written, tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture
-def source(written, tmp_path) -> Path:
-    return Path(shutil.copytree(written, tmp_path / "source"))
-
-
 # --- reading a file ---
 
 
@@ -83,36 +78,6 @@ def source(written, tmp_path) -> Path:
 def path(make_demo, tmp_path):
     demos = [make_demo(["0010011", "0001111"], seed=10_000 + k, size=32) for k in range(2)]
     return write_published(tmp_path / "hdf5" / "synthetic_task_demo.hdf5", demos, scene="<mujoco/>")
-
-
-def test_images_may_be_turned(path):
-    with PublishedFile(path) as file:
-        plain, flipped = next(file.images("demo_1")), next(file.images("demo_1", -1, -1))
-    for camera, image in plain.items():
-        np.testing.assert_array_equal(flipped[camera][::-1, ::-1], image)
-
-
-def delete(name):
-    return lambda group: group.__delitem__(name)
-
-
-def put(name, make):
-    def change(group):
-        old = group[name][:]
-        del group[name]
-        group[name] = make(old)
-
-    return change
-
-
-def attribute(name, value):
-    def change(group):
-        if value is None:
-            del group.attrs[name]
-        else:
-            group.attrs[name] = value
-
-    return change
 
 
 def test_files_are_found_behind_links_and_in_capitals(tmp_path):
@@ -167,19 +132,31 @@ def filtered(group):
     h5py.h5d.create(group.id, b"actions", h5py.h5t.NATIVE_DOUBLE, space, layout).write_direct_chunk((0, 0), b"packed")
 
 
+def put(name, make):
+    """Return a function that replaces an array of a group by a function of it, or removes it."""
+
+    def change(group):
+        old = group[name][:]
+        del group[name]
+        if make is not None:
+            group[name] = make(old)
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
         (filtered, "actions is compressed by the HDF5 filter 32999"),
-        (delete("states"), "'states' is missing"),
-        (delete("obs/robot0_eye_in_hand_image"), "'obs/robot0_eye_in_hand_image' is missing"),
+        (put("states", None), "'states' is missing"),
+        (put("obs/robot0_eye_in_hand_image", None), "'obs/robot0_eye_in_hand_image' is missing"),
         (put("actions", lambda old: old[:-1]), "states 7, actions 6"),
         (put("actions", lambda old: old.astype(np.int64)), "actions has type int64"),
         (put("states", lambda old: np.where(np.arange(7)[:, None] == 3, np.nan, old)), "states .* frame 3"),
         (put("obs/agentview_image", lambda old: old[:, :16]), "different sizes"),
-        (attribute("num_samples", 8), "num_samples is 8"),
-        (attribute("meta_data", None), "'meta_data' is missing"),
-        (attribute("meta_data", "{'key_frame': [2]}"), "meta_data is no valid JSON"),
+        (lambda group: group.attrs.__setitem__("num_samples", 8), "num_samples is 8"),
+        (lambda group: group.attrs.__delitem__("meta_data"), "'meta_data' is missing"),
+        (lambda group: group.attrs.__setitem__("meta_data", "{'key_frame': [2]}"), "meta_data is no valid JSON"),
     ],
 )
 def test_differences_of_a_group_are_named(path, change, reason):
@@ -314,8 +291,8 @@ def test_foreign_files_without_key_frames(stove, tmp_path):
     assert (restored.seed, restored.success) == (-1, True)
     np.testing.assert_array_equal(restored.states, stove.states)
     np.testing.assert_array_equal(restored.proprio, stove.proprio)
-    for name, column in labels(stove).columns().items():
-        assert np.array_equal(labels(restored).columns()[name], column), name
+    for name, column in labels(stove).items():
+        assert np.array_equal(labels(restored)[name], column), name
 
 
 @pytest.mark.slow
@@ -404,9 +381,6 @@ def test_bad_attributes_end_their_episode_or_file_only(written, tmp_path, monkey
     assert len(manifest["left_out"]) == len(named)
     assert f"Left out ({len(named)})" in (tmp_path / "ds" / "README.md").read_text()
     assert convert(folder, tmp_path / "ds") == summary, "reported again"
-
-
-# --- interrupted conversions ---
 
 
 # --- archives ---

@@ -153,7 +153,7 @@ def test_training_names_the_damaged_file(simulated, copy, tmp_path, capsys, kind
     assert ("git lfs pull" in last) == (damage is pointer)
 
 
-@pytest.mark.parametrize("command", ["validate", "describe", "cache", "train"])
+@pytest.mark.parametrize("command", ["validate", "train"])
 def test_earlier_format_is_named_with_its_converter(synthetic, copy, tmp_path, capsys, command):
     root = copy(synthetic)
     info = json.loads((root / "meta" / "info.json").read_text())

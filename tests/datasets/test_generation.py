@@ -18,7 +18,6 @@ from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.datasets.layout import is_dataset
 from lerobot_memobench.datasets.validate import episode_count
-from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
@@ -140,17 +139,11 @@ def tree_hash_of_run(tasks, out):
 
 
 def test_convention_of_the_images(tasks, recorded, tmp_path):
-    """Both datasets differ in the names of a camera and in the orientation; a run is not continued in another one."""
-    folders = {name: run(tasks[:1], tmp_path / name, 1, convention=name).folder for name in ("upright", "libero")}
-    frames = {
-        name: {key: frame_reader(folder, key)(0, [9])[0] for key in read_info(folder)["features"] if "images" in key}
-        for name, folder in folders.items()
-    }
-    assert [key.rpartition(".")[2] for key in frames["libero"]] == ["image", "image2"]
-    for mirrored, upright in zip(frames["libero"].values(), frames["upright"].values(), strict=True):
-        assert (mirrored - upright.flip(-1)).abs().mean() < 0.02 < (mirrored - upright).abs().mean()
+    folder = run(tasks[:1], tmp_path / "ds", 1, convention="libero").folder
+    names = [name for name in read_info(folder)["features"] if "images" in name]
+    assert names == ["observation.images.image", "observation.images.image2"]
     with pytest.raises(MemobenchError, match="with convention='libero', now 'upright'"):
-        run(tasks[:1], tmp_path / "libero", 1)
+        run(tasks[:1], tmp_path / "ds", 1)
 
 
 @pytest.mark.parametrize(

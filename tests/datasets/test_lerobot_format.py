@@ -37,7 +37,7 @@ def test_frames_are_equal_after_loading(dataset, demos):
     assert (dataset.num_episodes, len(dataset), dataset.fps) == (3, sum(map(len, demos)), 20)
     position = 0
     for number, demo in enumerate(demos):
-        columns = labels(demo).columns() | {"action": demo.actions, "observation.state": demo.proprio}
+        columns = labels(demo) | {"action": demo.actions, "observation.state": demo.proprio}
         assert read_episode(dataset.root, number).columns["states"].tolist() == demo.states.tolist()
         for t in range(0, len(demo), 3):
             item = dataset[position + t]
@@ -63,7 +63,7 @@ def test_every_number_has_a_name(dataset):
 
 
 def test_instructions_are_in_the_present_tense(stove):
-    columns = labels(stove).columns()
+    columns = labels(stove)
     assert set(columns["subgoal.instruction"]) == {"switch the stove on", "switch the stove off again"}
     assert "switched the stove on" in columns["subgoal.intermediate"]
 

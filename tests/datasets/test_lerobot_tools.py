@@ -112,8 +112,8 @@ def test_removed_states_are_compared_by_hash(ours, demos, tmp_path):
     _rewrite(edited, digest(demos[0]), "0" * 64)
     (verdict,) = validate(edited)
     assert str(verdict.disagreement).startswith("digest: recorded '000000")
-    _rewrite(edited, '"variant":0', '"variant":"none"')
-    with pytest.raises(MemobenchError, match=r"episode 0: .*episode_info .*variant"):
+    _rewrite(edited, '"world":"libero"', '"world":"another"')
+    with pytest.raises(MemobenchError, match=r"episode 0: .*episode_info .*world"):
         list_episodes(edited)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames, labels
 from lerobot_memobench.datasets.episodes import read_episode
 from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
@@ -42,11 +42,11 @@ def moved() -> Demonstration:
 
 def test_recorded_demonstration(stove):
     assert replay(as_recorded(stove)) is None
-    found = labels(stove)
-    assert (stove.success, stove.exec_start, found.operation[-1]) == (True, 0, -1)
-    assert (found.key_frames >= 0).all()
-    assert (np.diff(found.key_frames) >= 0).all()
-    assert found.key_frames[-1] <= len(stove) - HOLD_FRAMES
+    found, completion = labels(stove), key_frames(stove)
+    assert (stove.success, stove.exec_start, found["checkpoint.operation"][-1]) == (True, 0, -1)
+    assert (completion >= 0).all()
+    assert (np.diff(completion) >= 0).all()
+    assert completion[-1] <= len(stove) - HOLD_FRAMES
     # After success the fingers stay closed for some steps, then open.
     np.testing.assert_array_equal(stove.actions[[-HOLD_FRAMES, -1], 6], [1, -1])
     assert np.abs(stove.actions).max() <= 1
@@ -61,13 +61,13 @@ def test_held_frames(name, monkeypatch, tmp_path):
     begins, found = get_task(name).prompt_steps or 0, labels(demo)
     assert demo.success
     assert demo.exec_start == begins
-    np.testing.assert_array_equal(found.step, [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
-    np.testing.assert_array_equal(found.phase, np.arange(len(demo)) >= begins)
-    assert found.held[begins]
-    assert not found.held[:begins].any()
-    starts = np.flatnonzero(np.diff(found.held.astype(int), prepend=0) == 1)
+    np.testing.assert_array_equal(found["observation.step"], [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
+    np.testing.assert_array_equal(found["observation.phase"], np.arange(len(demo)) >= begins)
+    assert found["held"][begins]
+    assert not found["held"][:begins].any()
+    starts = np.flatnonzero(np.diff(found["held"].astype(int), prepend=0) == 1)
     assert len(starts) > (name == COUNTING)
-    held = np.flatnonzero(found.held[:-1])
+    held = np.flatnonzero(found["held"][:-1])
     assert not demo.applied[held].any()
     assert not demo.actions[held].any()
     for column in (demo.states, demo.proprio, demo.objects, demo.satisfied):
@@ -116,13 +116,12 @@ import json
 import sys
 from pathlib import Path
 from lerobot_memobench.datasets.record import RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.stage import staged
 from lerobot_memobench.tasks.catalogue import get_task
 
 task, seed, settings, folder = sys.argv[1:]
 job = RecordingJob(get_task(task), int(seed), RecordingSettings(images=False, **json.loads(settings)), Path(folder))
 job.run()
-made = staged(job)
+made = job.episode()
 print(made.failure or made.info["digest"])
 """
 

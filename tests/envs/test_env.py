@@ -301,7 +301,7 @@ SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_i
 @pytest.mark.parametrize(("name", "referent"), [(STOVE, "fixed"), pytest.param(SWAP, "random", marks=pytest.mark.slow)])
 def test_oracle_instruction_equals_the_dataset_frame_by_frame(name: str, referent: str) -> None:
     demo = record_demonstration(get_task(name), 10_000, images=False, referent=referent)
-    texts = [with_memory(demo.task.language, memory) for memory in labels(demo).memory]
+    texts = [with_memory(demo.task.language, memory) for memory in labels(demo)["oracle_memory"]]
     assert len(set(texts)) == 1 + len(demo.task.checkpoints)
     last = max(frame for frame, text in enumerate(texts) if text != texts[-1]) + 1  # the environment ends at success
     env = make(name, oracle_memory=True, expert_action=True, referent=referent)

@@ -207,7 +207,6 @@ def _shows_scans(record: DemonstrationRecord) -> bool:
 
 
 def _statistics(table: pd.DataFrame) -> dict[str, Any]:
-    """Return the statistics of episodes, with the keys of `FAMILIES`."""
     return {
         "tasks": table.task_name.nunique(),
         "episodes": len(table),
@@ -307,7 +306,6 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
 
 
 def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:
-    """Return a manifest of existing episodes."""
     versions = sorted({json.dumps(record.versions, sort_keys=True) for record, _ in episodes if record.versions})
     return {
         "versions": [json.loads(each) for each in versions],

@@ -44,7 +44,6 @@ from lerobot_memobench.datasets.stage import (
     episodes_folder,
     finished_manifest,
     stage_failure,
-    staged,
 )
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -142,7 +141,7 @@ def convert(
         for number, file in enumerate(files, 1):
             conversion.add(number, file)
         problems, notes = [*conversion.problems, *problems], conversion.notes
-        episodes = [episode for episode in map(staged, conversion.jobs) if episode.failure is None]
+        episodes = [job.episode() for job in conversion.jobs if job.failure() is None]
         if episodes:
             made_by = (
                 f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; columns that "
@@ -313,13 +312,7 @@ def inspect(file: SourceFile) -> Findings:
 
 @dataclass
 class _Conversion:
-    """Stage the episodes of one file after another.
-
-    Attributes:
-        jobs: one per demonstration that can be converted, all of them run.
-        problems, notes: of the files so far, in their order.
-        resumed: number of episodes that an earlier run had made.
-    """
+    """Stage the episodes of one file after another; ``resumed`` counts those that an earlier run had made."""
 
     source: Path
     staging: Path

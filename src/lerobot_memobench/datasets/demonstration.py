@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -39,8 +39,18 @@ style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
 LEVEL_COLUMNS = {level: f"subgoal.{level}" for level in LEVELS}
 """Level of a checkpoint's text -> column with its text at every frame."""
 INSTRUCTION_COLUMN, MEMORY_COLUMN, HELD_COLUMN = "subgoal.instruction", "oracle_memory", "held"
-NOT_HASHED = ("step", "coarse_subgoal", "subtask", "held")
-"""Labels that are not part of an episode's hash."""
+HASHED = {
+    "index": "checkpoint.index",
+    "operation": "checkpoint.operation",
+    "completed": "checkpoint.completed",
+    "event": "checkpoint.event",
+    "simple_subgoal": LEVEL_COLUMNS["intermediate"],
+    "grounded_subgoal": LEVEL_COLUMNS["fine"],
+    "memory": MEMORY_COLUMN,
+}
+"""Name of a label in an episode's hash -> its column."""
+Labels = dict[str, Any]
+"""Column -> T values: an array, or a list of texts."""
 LanguageRow = dict[str, Any]
 
 
@@ -138,65 +148,13 @@ class Demonstration:
 # --- labels ---
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """Per-frame columns of one episode of T frames; see `columns` for their names in a dataset.
-
-    The names of the fields are part of an episode's hash.
-
-    Attributes:
-        phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a strict task.
-        held: (T,) bool, whether the action at frame t of the execution has no effect.
-        index: (T,) int64, number of checkpoints completed in order before frame t: index of the present one.
-        operation: (T,) int64, 0 S, 1 U, 2 C of the present checkpoint, -1 after the last one.
-        completed: (T, 6) bool, whether checkpoint k was satisfied at any frame up to and including t.
-        event: (T,) bool, whether any checkpoint is satisfied for the first time at frame t.
-        simple_subgoal, grounded_subgoal, coarse_subgoal: T texts of the present checkpoint at the intermediate, fine
-            and coarse level. After the last one its text remains, so the columns are never empty.
-        memory: T oracle memories of the paper: intermediate texts of the completed checkpoints (`tasks.memory_text`).
-        subtask: T texts, the intermediate text of the present checkpoint as an instruction.
-        key_frames: (K,) int64, frame at which checkpoint k was completed in order, -1 if it never was.
-    """
-
-    phase: NDArray[np.int64]
-    step: NDArray[np.int64]
-    held: NDArray[np.bool_]
-    index: NDArray[np.int64]
-    operation: NDArray[np.int64]
-    completed: NDArray[np.bool_]
-    event: NDArray[np.bool_]
-    simple_subgoal: list[str]
-    grounded_subgoal: list[str]
-    coarse_subgoal: list[str]
-    memory: list[str]
-    subtask: list[str]
-    key_frames: NDArray[np.int64]
-
-    def columns(self) -> dict[str, NDArray | list[str]]:
-        """Return the dataset's column names and their T values each."""
-        return {
-            OBS_PHASE: self.phase.astype(np.float32),
-            OBS_STEP: self.step.astype(np.float32),
-            HELD_COLUMN: self.held,
-            "checkpoint.index": self.index,
-            "checkpoint.operation": self.operation,
-            "checkpoint.completed": self.completed,
-            "checkpoint.event": self.event,
-            LEVEL_COLUMNS["coarse"]: self.coarse_subgoal,
-            LEVEL_COLUMNS["intermediate"]: self.simple_subgoal,
-            LEVEL_COLUMNS["fine"]: self.grounded_subgoal,
-            INSTRUCTION_COLUMN: self.subtask,
-            MEMORY_COLUMN: self.memory,
-        }
-
-
 def labels(demo: Demonstration) -> Labels:
-    """Compute every checkpoint column of a demonstration.
+    """Return the label columns of a demonstration by their names in a dataset, T values each (`layout.COLUMNS`).
 
     A checkpoint is completed in order at the first frame at which its predicate is true and all earlier checkpoints
     were completed at this frame or before. Several may be completed at one frame. A predicate that was true too early
-    and is false in its turn is not completed in order; ``completed`` and ``event`` ignore the order.
+    and is false in its turn is not completed in order; ``completed`` and ``event`` ignore the order. After the last
+    checkpoint its texts remain, so the columns of subgoals are never empty.
     """
     task, length = demo.task, len(demo)
     if len(task.checkpoints) > MAX_CHECKPOINTS:
@@ -204,47 +162,45 @@ def labels(demo: Demonstration) -> Labels:
             f"task {task.name} has {len(task.checkpoints)} checkpoints; the column checkpoint.completed has room for "
             f"{MAX_CHECKPOINTS}; merge some of them"
         )
-    key_frames = _ordered_completion(demo.satisfied)
-    index = np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
+    completion = key_frames(demo)
+    # An event's own frame does not count: its checkpoint is the present one until the next frame.
+    index = np.searchsorted(completion[completion >= 0], np.arange(length), side="left").astype(np.int64)
     ever = np.logical_or.accumulate(demo.satisfied, axis=0)
     # One entry per value of index, 0 ... K; the last follows the last checkpoint. A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
-    texts = {}
-    for number, level in enumerate(LEVELS):
-        of_level = [checkpoint.language[number] for checkpoint in task.checkpoints] or [task.language]
-        texts[level] = [*of_level, of_level[-1]]
-    subtasks = subtask_texts(task)
-    subtasks.append(subtasks[-1])
-    memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
-    frames = np.arange(length, dtype=np.int64)
+    texts = {
+        LEVEL_COLUMNS[level]: [checkpoint.language[number] for checkpoint in task.checkpoints] or [task.language]
+        for number, level in enumerate(LEVELS)
+    }
+    texts[INSTRUCTION_COLUMN] = subtask_texts(task)
+    texts = {column: [*of_index, of_index[-1]] for column, of_index in texts.items()}
+    texts[MEMORY_COLUMN] = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
+    frames = np.arange(length)
     acting = frames >= demo.exec_start
-    return Labels(
-        phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
-        step=np.where(acting, NO_CLOCK if task.suite == STRICT else frames - demo.exec_start, frames),
-        held=np.zeros(length, np.bool_) if demo.held is None else demo.held,
-        index=index,
-        operation=np.array(codes, dtype=np.int64)[index],
-        completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
-        event=np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
-        simple_subgoal=[texts["intermediate"][k] for k in index],
-        grounded_subgoal=[texts["fine"][k] for k in index],
-        coarse_subgoal=[texts["coarse"][k] for k in index],
-        memory=[memories[k] for k in index],
-        subtask=[subtasks[k] for k in index],
-        key_frames=key_frames,
-    )
+    step = np.where(acting, NO_CLOCK if task.suite == STRICT else frames - demo.exec_start, frames)
+    return {
+        OBS_PHASE: np.where(acting, EXECUTION, PROMPT).astype(np.float32),
+        OBS_STEP: step.astype(np.float32),
+        HELD_COLUMN: np.zeros(length, np.bool_) if demo.held is None else demo.held,
+        "checkpoint.index": index,
+        "checkpoint.operation": np.array(codes, dtype=np.int64)[index],
+        "checkpoint.completed": np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
+        "checkpoint.event": np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
+        **{column: [of_index[k] for k in index] for column, of_index in texts.items()},
+    }
 
 
-def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    key_frames = np.full(satisfied.shape[1], -1, dtype=np.int64)
+def key_frames(demo: Demonstration) -> NDArray[np.int64]:
+    """Return the frame (K,) at which each checkpoint was completed in order (`labels`), -1 if it never was."""
+    completion = np.full(demo.satisfied.shape[1], -1, dtype=np.int64)
     frame = 0
-    for k in range(satisfied.shape[1]):
-        holds = np.flatnonzero(satisfied[frame:, k])
+    for k in range(demo.satisfied.shape[1]):
+        holds = np.flatnonzero(demo.satisfied[frame:, k])
         if holds.size == 0:
             break
         frame += int(holds[0])  # the next checkpoint may hold at this same frame
-        key_frames[k] = frame
-    return key_frames
+        completion[k] = frame
+    return completion
 
 
 # --- language rows ---
@@ -261,8 +217,8 @@ def persistent_rows(columns: Labels) -> list[LanguageRow]:
     A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins, so
     no row names a completion too early. The per-frame string columns contain every change.
     """
-    rows = [_row("subtask", text, frame) for frame, text in _changes(columns.subtask)]
-    rows += [_row("memory", text, frame) for frame, text in _changes(columns.memory) if text]
+    rows = [_row("subtask", text, frame) for frame, text in _changes(columns[INSTRUCTION_COLUMN])]
+    rows += [_row("memory", text, frame) for frame, text in _changes(columns[MEMORY_COLUMN]) if text]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
 
 
@@ -300,10 +256,9 @@ def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are not hashed: they are determined by the states, and a renderer may differ in a pixel where physics does
-    not. Visible objects and the labels of `NOT_HASHED` are determined by the other columns too; hashing them would
-    change the hashes of earlier datasets.
+    not. Visible objects and the other labels are determined by the hashed columns too.
     """
-    found = labels(demo)
+    frame_labels = labels(demo)
     identity = {
         "task": demo.task.name,
         "seed": demo.seed,
@@ -313,12 +268,13 @@ def digest(demo: Demonstration) -> str:
         "success": bool(demo.success),
         WORLD: LIBERO,
     }
-    columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
+    columns: Labels = {"states": demo.states, "actions": demo.actions, "key_frames": key_frames(demo)}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    if found.held.any():  # an added column changes no hash of demonstrations without holds
-        columns["held"] = found.held
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
+    if demo.held is not None and demo.held.any():
+        columns["held"] = demo.held
+    columns |= {name: frame_labels[column] for name, column in HASHED.items()}
+    columns["phase"] = frame_labels[OBS_PHASE].astype(np.int64)
     # The hash is independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):

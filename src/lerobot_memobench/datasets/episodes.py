@@ -20,7 +20,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames
 from lerobot_memobench.datasets.layout import (
     ADVICE,
     EPISODE_INFO,
@@ -94,11 +94,7 @@ def read_info(folder: Path) -> dict[str, Any]:
 def tables_of(
     folder: Path, wanted: Callable[[str], bool] = lambda _: True, rows: Filter | None = None
 ) -> Iterator[tuple[Path, pa.Table]]:
-    """Yield each Parquet file of a folder and its table, with the ``wanted`` ones of its columns.
-
-    Raises:
-        MemobenchError: there is no file, or one cannot be read.
-    """
+    """Yield each Parquet file of a folder and its table, with the ``wanted`` ones of its columns."""
     import pyarrow.parquet as pq
 
     files = files_below(folder, ".parquet")
@@ -150,16 +146,7 @@ def texts(column: pa.ChunkedArray) -> list[str]:
     return [(value[0] if isinstance(value, list) else value) or "" for value in column.to_pylist()]
 
 
-DETERMINED = {
-    "memory_type",
-    "family",
-    "operations",
-    "success",
-    "key_frames",
-    "scene_hash",
-    "fixture_poses",
-    "digest",
-}
+DETERMINED = {"memory_type", "family", "operations", "success", "key_frames", "scene_hash", "fixture_poses", "digest"}
 
 
 class DemonstrationRecord(BaseModel):
@@ -185,7 +172,7 @@ class DemonstrationRecord(BaseModel):
     seed: Whole = Field(description="seed of the scene")
     referent: str = Field(
         description="fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it "
-        "(strict tasks)",
+        "(strict tasks)"
     )
     variant: Count = Field(description="number of the referent or order; 0 is the published one")
     success: bool = Field(description="the goal was reached")
@@ -216,7 +203,7 @@ class DemonstrationRecord(BaseModel):
             variant=int(demo.variant),
             success=bool(demo.success),
             exec_start_index=int(demo.exec_start),
-            key_frames=labels(demo).key_frames.tolist(),
+            key_frames=key_frames(demo).tolist(),
             scene_hash=demo.scene_hash,
             fixture_poses={name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
             digest=digest(demo),
@@ -242,11 +229,7 @@ class DemonstrationRecord(BaseModel):
 
 
 def from_frames(text: str, where: str) -> DemonstrationRecord:
-    """Return the record in the text of an episode's first frame; ``where`` names dataset and episode in errors.
-
-    Raises:
-        MemobenchError: the text is no record.
-    """
+    """Return the record in the text of an episode's first frame; ``where`` names dataset and episode in errors."""
     try:
         record: DemonstrationRecord = checked(parsed(text), DemonstrationRecord)
     except Malformed as error:
@@ -267,18 +250,21 @@ def from_meta(row: Mapping[str, Any]) -> DemonstrationRecord | None:
 
 
 class EpisodeRequest(TypedDict):
-    """A requested episode, and the reason why it could not be made."""
+    """A requested episode."""
 
     task_name: str
     seed: Whole
+
+
+class FailedEpisode(EpisodeRequest):
+    """An episode that could not be made, and the reason."""
+
     failure: str
 
 
-class EpisodeEntry(TypedDict):
+class MadeEpisode(EpisodeRequest):
     """An episode of the dataset."""
 
-    task_name: str
-    seed: Whole
     failure: None
     episode_index: Count
     frames: Count
@@ -286,11 +272,7 @@ class EpisodeEntry(TypedDict):
 
 
 class ConversionNote(BaseModel):
-    """A part of a converted file, and the reason why it was left out, or a note on it.
-
-    Attributes:
-        group: group of the file, "" for the file as a whole.
-    """
+    """A group of a converted file ("": the file as a whole), and the reason why it was left out, or a note on it."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -312,7 +294,7 @@ class FileHash(TypedDict):
 class Manifest(TypedDict):
     """``manifest.json``: the request of a run, and the hashes of its episodes and files."""
 
-    episodes: list[EpisodeEntry | EpisodeRequest]
+    episodes: list[MadeEpisode | FailedEpisode]
     request: NotRequired[dict[str, Any]]
     left_out: NotRequired[list[ConversionNote]]
     notes: NotRequired[list[ConversionNote]]
@@ -320,12 +302,7 @@ class Manifest(TypedDict):
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of the dataset in ``folder``.
-
-    Raises:
-        FileNotFoundError: there is none.
-        MemobenchError: it is none of this package's.
-    """
+    """Return the manifest of a dataset, or raise FileNotFoundError."""
     advice = "this package did not write it like that; take the dataset from its source again"
     manifest: dict[str, Any] = read_json(folder / MANIFEST_FILE, Manifest, advice)
     return manifest
@@ -355,11 +332,7 @@ class ListedEpisode:
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:
-    """Return a dataset's episodes with their records, in order.
-
-    Raises:
-        MemobenchError: the folder is no dataset, or a record in it is damaged.
-    """
+    """Return a dataset's episodes with their records, in order."""
     read_info(folder)
     rows = _rows(folder)
     own = ("episode_index", EPISODE_INFO)
@@ -391,11 +364,7 @@ def episodes_where(folder: Path | str, **wanted: Any) -> list[int]:
 
 
 def check_suite_of(folder: Path, suite: str) -> None:
-    """Refuse a LeRobotDataset with a task of another suite; tasks outside the catalogue belong to none.
-
-    Raises:
-        MemobenchError: naming the first such task.
-    """
+    """Refuse a LeRobotDataset with a task of another suite; tasks outside the catalogue belong to none."""
     for episode in list_episodes(folder) if is_dataset(folder) else ():
         name = episode.record.task_name if episode.record is not None else ""
         own = suite_of(name)
@@ -422,11 +391,7 @@ class RecordedEpisode:
 
 
 def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
-    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``.
-
-    Raises:
-        MemobenchError: there is no dataset or no such episode, or another program made it.
-    """
+    """Read an episode of a dataset that this package made; without states/, its columns lack ``states``."""
     root = Path(root)
     read_info(root)
     rows = _rows(root, episode_index)
@@ -451,12 +416,13 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
 
 
 def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[str | None], length: int) -> None:
-    """Raise if the two records of an episode, or its frames, contradict each other."""
     in_meta = from_meta(row)
     for key in DemonstrationRecord.model_fields if in_meta is not None else ():
-        here, there = getattr(record, key), getattr(in_meta, key)
-        if key != "versions" and here != there:
-            raise MemobenchError(f"meta/episodes has {key}={there!r}, the frames' column {EPISODE_INFO} {here!r}")
+        of_frames, of_meta = getattr(record, key), getattr(in_meta, key)
+        if key != "versions" and of_frames != of_meta:
+            raise MemobenchError(
+                f"meta/episodes has {key}={of_meta!r}, the frames' column {EPISODE_INFO} {of_frames!r}"
+            )
     again = next((frame for frame, text in enumerate(texts) if frame and text), None)
     if again is not None:
         raise MemobenchError(
@@ -467,7 +433,7 @@ def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[
 
 
 def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]]:
-    """Return the rows of meta/episodes, or that of one episode, in order and without statistics."""
+    """Return the rows of meta/episodes, or that of one episode, without statistics."""
     own = ("episode_index", "length", "dataset_from_index", *DemonstrationRecord.model_fields)
     chosen = None if episode_index is None else [("episode_index", "==", episode_index)]
     return read_table(folder / EPISODES, own.__contains__, chosen).sort_by("episode_index").to_pylist()
@@ -550,16 +516,16 @@ def _check_bounds(folder: Path, info: dict[str, Any]) -> None:
                 _check_video(folder / path, round(stops[-1]))
 
 
-def expect(where: Path | str, key: str, found: Any, wanted: Any) -> None:
+def expect(where: Path | str, key: str, values: Any, wanted: Any) -> None:
     """Raise `MemobenchError` at the first difference of two sequences of numbers, texts or sets."""
-    found, wanted = np.asarray(found), np.asarray(wanted)
-    if found.shape == wanted.shape:
+    values, wanted = np.asarray(values), np.asarray(wanted)
+    if values.shape == wanted.shape:
         is_number = wanted.dtype.kind in "iuf"
-        differs = np.flatnonzero(~(abs(found - wanted) <= TOLERANCE) if is_number else found != wanted)
+        differs = np.flatnonzero(~(abs(values - wanted) <= TOLERANCE) if is_number else values != wanted)
         if not differs.size:
             return
-        found, wanted, key = found[differs[:1]], wanted[differs[:1]], f"{key} of row {differs[0]}"
-    raise MemobenchError(f"{where}: {key} is {short(found.tolist())}, expected {short(wanted.tolist())}; {ADVICE}")
+        values, wanted, key = values[differs[:1]], wanted[differs[:1]], f"{key} of row {differs[0]}"
+    raise MemobenchError(f"{where}: {key} is {short(values.tolist())}, expected {short(wanted.tolist())}; {ADVICE}")
 
 
 def _table(folder: Path, part: str) -> pd.DataFrame:
@@ -574,7 +540,6 @@ def _table(folder: Path, part: str) -> pd.DataFrame:
 
 
 def _paths(template: str, rows: pd.DataFrame, prefix: str) -> NDArray:
-    """Return the file of each episode by its numbers in meta/episodes."""
     numbers = zip(rows[f"{prefix}/chunk_index"], rows[f"{prefix}/file_index"], strict=True)
     return np.array([template.format(chunk_index=int(chunk), file_index=int(file)) for chunk, file in numbers])
 
@@ -584,28 +549,23 @@ def _check_video(path: Path, frames: int) -> None:
     import av
 
     check_fetched(path)
-    size, place = path.stat().st_size, 0
+    size, start = path.stat().st_size, 0
     with path.open("rb") as file:
-        while path.suffix == ".mp4" and place < size:
-            file.seek(place)
+        while path.suffix == ".mp4" and start < size:
+            file.seek(start)
             head = file.read(16)
-            length = int.from_bytes(head[:4]) or size - place
+            length = int.from_bytes(head[:4]) or size - start  # 0: to the end of the file; 1: in the next 8 bytes
             length = int.from_bytes(head[8:]) if length == 1 else length
-            if length < 8 or place + length > size:
-                raise MemobenchError(f"{path} is cut off or damaged at byte {place:,} of {size:,}; {ADVICE}")
-            place += length
+            if length < 8 or start + length > size:
+                raise MemobenchError(f"{path} is cut off or damaged at byte {start:,} of {size:,}; {ADVICE}")
+            start += length
     with av.open(str(path)) as container:
-        there = container.streams.video[0].frames
-    if 0 < there < frames:
-        raise MemobenchError(f"{path} has {there} frames, meta/episodes names {frames}; {ADVICE}")
+        stated = container.streams.video[0].frames
+    if 0 < stated < frames:
+        raise MemobenchError(f"{path} has {stated} frames, meta/episodes names {frames}; {ADVICE}")
 
 
-def read_all(folder: Path) -> None:
-    """Read a whole dataset to its end.
-
-    Raises:
-        MemobenchError: naming the first file that is missing or cannot be read.
-    """
+def _read_all(folder: Path) -> None:
     tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
     for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
         if not path.is_file():
@@ -617,11 +577,7 @@ def read_all(folder: Path) -> None:
 
 
 def read_to_end(path: Path) -> None:
-    """Read all values of a table, or decode all frames of a video.
-
-    Raises:
-        MemobenchError: a part of it cannot be read.
-    """
+    """Read all values of a table, or decode all frames of a video."""
     import av
     import pyarrow.parquet as pq
 
@@ -642,8 +598,7 @@ def read_to_end(path: Path) -> None:
 def naming_damage(folder: Path | None) -> Iterator[None]:
     """Replace an error of LeRobot in reading a dataset by a `MemobenchError` that names the damaged file.
 
-    Args:
-        folder: the dataset; None if it is unknown, then errors pass.
+    Errors pass if ``folder`` is None, for a dataset that is not on this disk.
     """
     try:
         yield
@@ -655,7 +610,7 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
         if folder is None or not reading or not (folder / INFO_FILE).is_file():
             raise
         try:
-            read_all(folder)
+            _read_all(folder)
             check_whole(folder)
         except MemobenchError as damage:
             raise damage from error

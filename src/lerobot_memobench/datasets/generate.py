@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -24,7 +24,6 @@ from lerobot_memobench.datasets.stage import (
     check_destination,
     episodes_folder,
     finished_manifest,
-    staged,
 )
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -80,13 +79,71 @@ def generate(
         seed_base: episode i has the scene of seed ``seed_base`` + i.
         finish: assemble the dataset of an unfinished run's episodes, and make no further episode.
         notify: called before the first episode with the approximate size and duration.
-        referent, images, image_size, demonstration_prompt, perturb, convention: see `recording.RecordingSettings`.
+        referent, images, image_size, demonstration_prompt, perturb, convention: see `RecordingSettings`.
 
     Raises:
         MemobenchError: invalid arguments, seeds of a guarded split, ``out`` holds something else or a damaged dataset,
             another run is writing there, its disk has no room (finished episodes stay), or an episode could not be run
             at all, which no later run would change.
     """
+    _check_request(tasks, episodes, prompted_episodes, seed_base, demonstration_prompt, workers)
+    out, referent = Path(out), referent_text(referent, drawn=all(task.drawn for task in tasks))
+    check_choice("convention", convention, [*CONVENTIONS])
+    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, convention)
+    request = {
+        "tasks": [task.name for task in tasks],
+        "episodes": episodes,
+        "prompted_episodes": prompted_episodes,
+        "seed_base": seed_base,
+        WORLD: LIBERO,
+        "hold_frames": HOLD_FRAMES,
+        **asdict(settings),
+        "task_files": [task_hash(task) for task in tasks],
+        "versions": _versions(),
+    }
+    prompts = "" if demonstration_prompt else ", demonstration prompts left out"
+    more = "" if prompted_episodes is None else f" ({prompted_episodes} of those with a prompt)"
+    moved = ", the arm disturbed at random in two thirds of them" if perturb else ""
+    seeds = f"{episodes} seeds per task{more} from {seed_base} on"
+    made_by = f"`memobench generate`, {seeds}, referent {referent}{prompts}{moved}. {SCRIPTED}"
+    if not finish:
+        check_assets()
+        manifest = finished_manifest(out, request)
+        if manifest is not None:
+            return _summary(manifest["episodes"], tasks, out)
+        check_destination(out)
+    elif is_dataset(out) or not (out / STAGING).is_dir():
+        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
+    continues = "" if finish else ", and the same command continues"
+    with explaining_disk_errors(out, f"finished episodes stay{continues}"), episodes_folder(out, request) as folder:
+        jobs: list[RecordingJob] = []
+        for task in tasks:
+            for i in range(episodes_of(task, episodes, prompted_episodes)):
+                jobs.append(RecordingJob(task, seed_base + i, settings, folder / f"{len(jobs):06d}"))
+        if finish:
+            finished = [job for job in jobs if job.finished()]
+            made_by += f" The run was finished early: {len(finished)} of {len(jobs)} seeds were run."
+            request[FINISHED_EARLY] = len(finished) < len(jobs)
+            jobs = finished
+        else:
+            _report_size(jobs, settings, out, workers, notify)
+            run_jobs(jobs, workers=workers, progress=progress)
+        made = [job.episode() for job in jobs]
+        summary = _summary([{**episode.info, "failure": episode.failure} for episode in made], tasks, out)
+        if summary.folder is not None:
+            assemble(made, out, repo_id=repo_id, made_by=made_by, manifest={"request": request})
+            shutil.rmtree(out / STAGING)
+        return summary
+
+
+def _check_request(
+    tasks: Sequence[Task],
+    episodes: int,
+    prompted_episodes: int | None,
+    seed_base: int,
+    demonstration_prompt: bool,
+    workers: int,
+) -> None:
     most = episodes if prompted_episodes is None else prompted_episodes
     if not tasks or min(episodes, most, workers) < 1:
         raise MemobenchError(
@@ -111,99 +168,6 @@ def generate(
             f"demonstrations of {hiding.name} were asked for without its demonstration prompt, which hides the object "
             "to find; leave out --no-demonstration-prompt"
         )
-    referent = referent_text(referent, drawn=all(task.drawn for task in tasks))
-    check_choice("convention", convention, [*CONVENTIONS])
-    settings = RecordingSettings(referent, images, image_size, demonstration_prompt, perturb, convention)
-    plan = _Plan(tuple(tasks), episodes, prompted_episodes, seed_base, settings, repo_id)
-    if finish:
-        return _finish_early(plan, Path(out))
-    check_assets()
-    return _run(plan, Path(out), workers, progress, notify)
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """Episodes that a run has to make, and its settings."""
-
-    tasks: tuple[Task, ...]
-    episodes: int
-    prompted_episodes: int | None
-    seed_base: int
-    settings: RecordingSettings
-    repo_id: str
-
-    @property
-    def request(self) -> dict[str, Any]:
-        """Settings that an unfinished run must share to be continued."""
-        return {
-            "tasks": [task.name for task in self.tasks],
-            "episodes": self.episodes,
-            "prompted_episodes": self.prompted_episodes,
-            "seed_base": self.seed_base,
-            WORLD: LIBERO,
-            "hold_frames": HOLD_FRAMES,
-            **asdict(self.settings),
-            "task_files": [task_hash(task) for task in self.tasks],
-            "versions": _versions(),
-        }
-
-    @property
-    def made_by(self) -> str:
-        """Sentences for the card."""
-        prompts = "" if self.settings.demonstration_prompt else ", demonstration prompts left out"
-        more = "" if self.prompted_episodes is None else f" ({self.prompted_episodes} of those with a prompt)"
-        seeds = f"{self.episodes} seeds per task{more} from {self.seed_base} on"
-        moved = ", the arm disturbed at random in two thirds of them" if self.settings.perturb else ""
-        return f"`memobench generate`, {seeds}, referent {self.settings.referent}{prompts}{moved}. {SCRIPTED}"
-
-    def jobs(self, folder: Path) -> list[RecordingJob]:
-        jobs: list[RecordingJob] = []
-        for task in self.tasks:
-            for i in range(episodes_of(task, self.episodes, self.prompted_episodes)):
-                jobs.append(RecordingJob(task, self.seed_base + i, self.settings, folder / f"{len(jobs):06d}"))
-        return jobs
-
-
-# --- the run ---
-
-
-def _run(
-    plan: _Plan, out: Path, workers: int, progress: ProgressCallback | None, notify: Callable[[str], None]
-) -> GenerationSummary:
-    manifest = finished_manifest(out, plan.request)
-    if manifest is not None:
-        return _summary(manifest["episodes"], plan, out)
-    check_destination(out)
-    with (
-        explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
-        episodes_folder(out, plan.request) as folder,
-    ):
-        jobs = plan.jobs(folder)
-        _report_size(plan, jobs, out, workers, notify)
-        run_jobs(jobs, workers=workers, progress=progress)
-        return _assembled(plan, jobs, out, plan.request, plan.made_by)
-
-
-def _finish_early(plan: _Plan, out: Path) -> GenerationSummary:
-    if is_dataset(out) or not (out / STAGING).is_dir():
-        raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
-    with explaining_disk_errors(out, "finished episodes stay"), episodes_folder(out, plan.request) as folder:
-        jobs = plan.jobs(folder)
-        finished = [job for job in jobs if job.finished()]
-        made_by = f"{plan.made_by} The run was finished early: {len(finished)} of {len(jobs)} seeds were run."
-        return _assembled(plan, finished, out, {**plan.request, FINISHED_EARLY: len(finished) < len(jobs)}, made_by)
-
-
-def _assembled(
-    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, request: Mapping[str, Any], made_by: str
-) -> GenerationSummary:
-    """Assemble the dataset of finished jobs, if one of them has an episode, and remove the staging folder."""
-    episodes = [staged(job) for job in jobs]
-    summary = _summary([{**episode.info, "failure": episode.failure} for episode in episodes], plan, out)
-    if summary.folder is not None:
-        assemble(episodes, out, repo_id=plan.repo_id, made_by=made_by, manifest={"request": request})
-        shutil.rmtree(out / STAGING)
-    return summary
 
 
 def episodes_of(task: Task, episodes: int, prompted_episodes: int | None) -> int:
@@ -218,9 +182,8 @@ def task_hash(task: Task) -> str:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions on which an episode's numbers depend."""
     versions = {}
-    for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):
+    for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):  # an episode's numbers depend on them
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
@@ -256,12 +219,12 @@ def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None],
 
 
 def _report_size(
-    plan: _Plan, jobs: Sequence[RecordingJob], out: Path, workers: int, notify: Callable[[str], None]
+    jobs: Sequence[RecordingJob], settings: RecordingSettings, out: Path, workers: int, notify: Callable[[str], None]
 ) -> None:
     missing = [job for job in jobs if not job.folder.exists()]
     if not missing:
         return
-    side = plan.settings.image_size if plan.settings.images else None
+    side = settings.image_size if settings.images else None
     frames, left = (
         sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
     )
@@ -305,8 +268,7 @@ class GenerationSummary:
         return [episode for episode in self.episodes if episode.failure is not None]
 
 
-def _summary(rows: Sequence[dict[str, Any]], plan: _Plan, out: Path) -> GenerationSummary:
-    """Return the outcome of a run from the rows of its manifest."""
+def _summary(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
     episodes = tuple(EpisodeOutcome(row["task_name"], row["seed"], row["frames"], row["failure"]) for row in rows)
     made = any(episode.failure is None for episode in episodes)
-    return GenerationSummary(out if made else None, tuple(task.name for task in plan.tasks), episodes)
+    return GenerationSummary(out if made else None, tuple(task.name for task in tasks), episodes)

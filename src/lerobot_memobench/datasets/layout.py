@@ -52,13 +52,13 @@ def without_pattern(folder: Path) -> Path:
     It is the folder itself, or a link to it in the cache. The link is the same at every call, because LeRobot caches
     the tables by path.
     """
-    place = str(folder.absolute())
-    if glob.escape(place) == place or not folder.is_dir():
+    path = str(folder.absolute())
+    if glob.escape(path) == path or not folder.is_dir():
         return folder
-    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(place)).hexdigest()[:16]
+    link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
     link.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
-        link.symlink_to(place)
+        link.symlink_to(path)
     return link
 
 

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +39,7 @@ class RecordingSettings:
 
     Attributes:
         referent: ``"fixed"``, the task's own goal, or ``"random"``, the seed's; of a strict task ``"drawn"``.
-        images: whether the cameras are recorded.
-        image_size: height and width of their images, pixels.
+        image_size: height and width of images, pixels.
         demonstration_prompt: whether the episode begins with the task's prompt, if it has one.
         perturb: whether the arm is moved off its way at random (`Perturbation`).
         convention: in which the images are written (`sim.convention`).
@@ -101,7 +99,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         executed.append(episode.applied_action)
         actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     assert episode.exec_start is not None
-    labelled, applied = (np.array(found, dtype=np.float32) for found in (actions, executed))
+    labelled, applied = (np.array(column, dtype=np.float32) for column in (actions, executed))
     return Demonstration(
         task=episode.task,
         seed=episode.seed,
@@ -148,7 +146,7 @@ class RecordingJob(StagedJob):
 
     @property
     def task_name(self) -> str:
-        """The task's name."""
+        """The task's name, for the progress."""
         return self.task.name
 
     def run(self) -> None:
@@ -167,21 +165,9 @@ class RecordingJob(StagedJob):
         except Exception as error:
             error.add_note(f"while recording {where}")
             raise
-        stage_failure(_failed_info(demo), reason, self.folder)
-
-
-def _failed_info(demo: Demonstration) -> dict[str, Any]:
-    """Return the fields that are stored for a seed without a demonstration."""
-    return {
-        "task_name": demo.task.name,
-        "memory_type": demo.task.memory_type,
-        "seed": demo.seed,
-        "referent": demo.referent,
-        "variant": demo.variant,
-        "success": False,
-        "frames": len(demo),
-        "scene_hash": demo.scene_hash,
-    }
+        info = {"task_name": demo.task.name, "seed": demo.seed, "referent": demo.referent, "variant": demo.variant}
+        info |= {"success": False, "frames": len(demo), "scene_hash": demo.scene_hash}
+        stage_failure(info, reason, self.folder)
 
 
 # --- perturbation ---
@@ -241,9 +227,7 @@ class Perturbation:
     def executed(self, action: NDArray[np.float32], at_detent: bool = False) -> NDArray[np.float32]:
         """Return the action (7,) to execute instead of the expert's. Call once per step.
 
-        Args:
-            at_detent: whether the hand is in the detent at home; there small actions are not perturbed, because the
-                hand would never come to rest.
+        ``at_detent``, in the detent at home, small actions are not perturbed: the hand would never come to rest.
         """
         if self._clean or (at_detent and np.abs(action[:6]).max() <= COMING_TO_REST):
             return action
@@ -255,20 +239,19 @@ class Perturbation:
             self._grasp()
         elif not self._left and self._rng.random() < PUSH_CHANCE:
             self._begin(PUSH * self._rng.normal(size=6), PUSH_STEPS)
-        found = action.astype(np.float64)
-        found[:6] += NOISE * self._rng.normal(size=6)
+        executed = action.astype(np.float64)
+        executed[:6] += NOISE * self._rng.normal(size=6)
         if self._left:
-            found[:6] += self._push
+            executed[:6] += self._push
             self._left -= 1
         if self._closed in self._open:
-            found[6] = -1.0
+            executed[6] = -1.0
         elif self._late and action[6] < 0:
-            found[6] = 1.0
+            executed[6] = 1.0
             self._late -= 1
-        return found.astype(np.float32)
+        return executed.astype(np.float32)
 
     def _grasp(self) -> None:
-        """Draw the perturbation of a grasp."""
         self._open = range(0)
         draw = self._rng.random()
         if draw < MISS_CHANCE:

@@ -73,14 +73,14 @@ class EpisodeFile(BaseModel):
 
 @dataclass(frozen=True)
 class StagedEpisode:
-    """A finished episode's folder and the content of its `EpisodeFile`; arrays and videos are read on demand."""
+    """A finished episode's folder and its `EpisodeFile`; arrays and videos are read on demand."""
 
     folder: Path
     content: EpisodeFile
 
     @property
     def failure(self) -> str | None:
-        """Why there is no demonstration of this seed, or None."""
+        """See `EpisodeFile`."""
         return self.content.failure
 
     @property
@@ -131,43 +131,38 @@ def read_staged(folder: Path) -> StagedEpisode | None:
 
 
 class StagedJob:
-    """A job that makes one episode, complete or absent; two workers may run the same job."""
+    """A job that makes one episode in ``folder``; two workers may run the same job."""
 
     folder: Path
 
     def finished(self) -> bool:
-        """Return whether ``folder`` holds the episode, or the reason why there is none."""
+        """Return whether ``folder`` holds the episode, or the reason of its failure."""
         return read_staged(self.folder) is not None
+
+    def episode(self) -> StagedEpisode:
+        """Return the episode of a finished job."""
+        episode = read_staged(self.folder)
+        if episode is None:
+            raise MemobenchError(f"{self.folder} was removed during the run; run the command again")
+        return episode
 
     def failure(self) -> str | None:
         """Return why a finished job has no episode, or None."""
-        return staged(self).failure
-
-
-def staged(job: StagedJob) -> StagedEpisode:
-    """Return the finished episode of a job that was run."""
-    episode = read_staged(job.folder)
-    if episode is None:
-        raise MemobenchError(f"{job.folder} was removed during the run; run the command again")
-    return episode
+        return self.episode().failure
 
 
 # --- writing an episode ---
 
 
 class EpisodeStage:
-    """Write one episode: images frame by frame, everything else at the end.
+    """Write one episode to ``folder``, images frame by frame, everything else at the end; an equal one is kept.
 
-    A context: an episode that was not published when it ends is removed.
-
-    Args:
-        folder: folder of the finished episode; an equal one that exists already is kept.
-        convention: of the videos (`sim.convention`).
+    A context: an episode that was not published when it ends is removed. ``convention`` is that of the videos.
     """
 
     def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
         self._folder, self._convention = folder, convention
-        self._temporary = temporary_folder(folder)
+        self._temporary = _temporary_folder(folder)
         names = CONVENTIONS[convention].values()
         self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
         self._histograms = {name: ImageHistograms() for name in names}
@@ -201,7 +196,7 @@ class EpisodeStage:
         columns = labels(demo)
         record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
         info = record | {"language": demo.task.language, "frames": len(demo)}
-        _check_storable(info, columns.columns())
+        _check_storable(info, columns)
         for video in self._videos.values():
             video.close()
         stats = {
@@ -214,7 +209,7 @@ class EpisodeStage:
             "proprio": demo.proprio,
             "objects": demo.objects,
             **({} if demo.executed is None else {"executed": demo.executed}),
-            **columns.columns(),
+            **columns,
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
         return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)
@@ -244,7 +239,7 @@ def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPR
 
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
     """Store the reason why a seed has no demonstration, so that a resumed run reports it as well."""
-    temporary = temporary_folder(folder)
+    temporary = _temporary_folder(folder)
     try:
         return _publish(temporary, folder, reason, info, [], {})
     finally:
@@ -277,7 +272,7 @@ def _publish(
     return StagedEpisode(folder, content)
 
 
-def temporary_folder(folder: Path) -> Path:
+def _temporary_folder(folder: Path) -> Path:
     """Make and return an empty folder, to be renamed to ``folder`` when it is complete.
 
     Killed workers leave such folders, which are removed with the staging folder.
@@ -348,11 +343,9 @@ def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dic
 
     A staging folder that a kill in the last moment left is removed.
 
-    Args:
-        required: keys that the manifest must have.
-
     Raises:
-        MemobenchError: the dataset is damaged, has another request, or another command made it.
+        MemobenchError: the dataset is damaged, has another request, or another command made it, whose manifest lacks
+            a ``required`` key.
     """
     if not is_dataset(out):
         return None
@@ -373,7 +366,6 @@ def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dic
 
 
 def _compare_requests(earlier: dict[str, Any], request: dict[str, Any], subject: str, advice: str) -> None:
-    """Raise, naming the first setting that differs."""
     for key, value in {FINISHED_EARLY: False, **request}.items():  # only `generate --finish` writes this key
         before = {FINISHED_EARLY: False, **earlier}.get(key)
         if before != value:

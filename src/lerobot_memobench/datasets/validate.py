@@ -8,7 +8,7 @@ must be near to the decoded ones.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -70,13 +70,7 @@ NO_HASHES = (
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Outcome of the check of an episode or a file.
-
-    Attributes:
-        subject: ``episode 3``, or a file.
-        disagreement: the first disagreement, None if everything agrees.
-        note: remark on a file that agrees.
-    """
+    """First disagreement of an episode or a file, None if everything agrees, and a note on a file that agrees."""
 
     subject: str
     disagreement: str | None
@@ -86,10 +80,7 @@ class CheckResult:
 
 @dataclass(frozen=True)
 class _Check:
-    """A check of an episode, of a file, or of its agreement with others; runs in any process.
-
-    ``check`` returns a disagreement of an episode, or a note on a file, or None, and raises for damage.
-    """
+    """A check, which returns a disagreement of an episode, or a note on a file, or None, and raises for damage."""
 
     subject: str
     path: Path
@@ -110,7 +101,6 @@ def validate(
     folder: Path | str,
     *,
     workers: int = 1,
-    tasks: Mapping[str, Task] | None = None,
     progress: Callable[[int, int, CheckResult], None] = lambda *_: None,
 ) -> list[CheckResult]:
     """Replay the episodes of a dataset and check its files.
@@ -119,9 +109,7 @@ def validate(
     scene must be equal; some frames of each camera must be near to those of the simulator. Every file is read to its
     end and compared with its hash, statistics with those of the frames, and the manifest with the episodes.
 
-    Args:
-        tasks: name to task, for tasks that are not in the catalogue.
-        progress: called after each check with the number of finished checks, their total, and the latest result.
+    ``progress`` is called after each check with the number of finished checks, their total, and the latest result.
 
     Returns:
         The result of each episode, in order, then of each file with a disagreement or a note.
@@ -132,7 +120,15 @@ def validate(
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks = [*_episode_checks(folder, tasks), *_file_checks(folder)]
+    if not is_dataset(folder):
+        raise MemobenchError(
+            f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
+            "by `memobench convert`"
+        )
+    checks = [
+        _Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k)) for k in range(episode_count(folder))
+    ]
+    checks += _file_checks(folder)
     results: dict[int, CheckResult] = {}
 
     def add(number: int, result: CheckResult) -> None:
@@ -194,22 +190,11 @@ def _file_checks(folder: Path) -> Iterator[_Check]:
         yield of(MANIFEST_FILE, partial(check_manifest, folder))
 
 
-def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
-    if not is_dataset(folder):
-        raise MemobenchError(
-            f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
-            "by `memobench convert`"
-        )
-    count = episode_count(folder)
-    return [_Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k, tasks)) for k in range(count)]
-
-
-def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) -> str | None:
+def _replay_episode(folder: Path, index: int) -> str | None:
     episode = read_episode(folder, index)
     if episode.record.seed < 0:
         return "it has no seed, so its scene cannot be made again"
-    task, images = (tasks or {}).get(episode.record.task_name), images_of(folder, index)
-    difference = replay(episode, task=task, images=images)
+    difference = replay(episode, images_of(folder, index))
     return None if difference is None else str(difference)
 
 
@@ -217,11 +202,7 @@ def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) 
 
 
 def episode_count(folder: Path) -> int:
-    """Return the number of episodes of the dataset in ``folder``, by ``meta/info.json`` and ``meta/episodes``.
-
-    Raises:
-        MemobenchError: they cannot be read, or disagree.
-    """
+    """Return the number of episodes, on which ``meta/info.json`` and ``meta/episodes`` must agree."""
     count, rows = int(read_info(folder)["total_episodes"]), len(read_table(folder / EPISODES, "episode_index".__eq__))
     if rows != count:
         raise MemobenchError(
@@ -330,22 +311,20 @@ class Disagreement:
         return f"{self.column}{where}: recorded {_text(self.recorded)}, replayed {_text(self.replayed)}"
 
 
-def replay(recorded: RecordedEpisode, *, task: Task | None = None, images: Images | None = None) -> Disagreement | None:
+def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreement | None:
     """Replay an episode and return the first disagreement, or None.
 
     Compared are states (if recorded), proprioception, visible objects, instruction, numbering, every label column,
     language rows, success, key frames, and the hashes of scene and episode. The episode's hash covers the states, which
     LeRobot's dataset tools remove.
 
-    Args:
-        task: replaces the catalogue's task of the episode's name.
-        images: returns recorded images; some of them are compared.
+    ``images`` returns recorded images; some of them are compared.
 
     Raises:
         MemobenchError: there is no such task, or the actions were removed.
     """
     record, columns = recorded.record, recorded.columns
-    task = (task or get_task(record.task_name)).variant(record.variant)
+    task = get_task(record.task_name).variant(record.variant)
     if "action" not in columns:
         raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
     actions = columns["action"]
@@ -373,7 +352,7 @@ def replay(recorded: RecordedEpisode, *, task: Task | None = None, images: Image
         "states": again.states,
         "observation.state": again.proprio,
         objects_column(columns): again.objects,
-        **columns_again.columns(),
+        **columns_again,
     }
     return _first_difference(columns, replayed) or image_check.difference or of_episode
 

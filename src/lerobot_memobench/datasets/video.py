@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 
 def _encoder() -> RGBEncoderConfig:
-    """Return the encoder settings as LeRobot's configuration."""
     from lerobot.configs import RGBEncoderConfig
 
     return RGBEncoderConfig(vcodec="h264", preset="ultrafast", g=10, crf=23, extra_options={"bf": 0})
@@ -83,7 +82,6 @@ class VideoWriter:
         """Close the unfinished file, which will be deleted."""
         if self._container is not None:
             self._container.close()
-            self._container = None
 
 
 def mirror_video(source: Path, path: Path, rate: int) -> None:
@@ -166,10 +164,8 @@ class ImageHistograms:
     def stats(self, *, sampled: bool = False) -> Stats:
         """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
 
-        They are over LeRobot's sample of frames, but exact over its pixels: values of eight bits need 256 bins.
-
-        Args:
-            sampled: whether the added frames are the sample, not the episode.
+        They are over LeRobot's sample of the added frames (``sampled``: these are the sample), but exact over its
+        pixels: values of eight bits need 256 bins.
         """
         from lerobot.datasets.compute_stats import sample_indices
 
@@ -236,7 +232,6 @@ def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> Fram
 
 
 def _decoder() -> Callable[[Path, list[float]], Tensor]:
-    """Return a function from a video and times in it, s, to its frames."""
     from lerobot.datasets import video_utils
 
     backend = video_utils.get_safe_default_video_backend()
@@ -254,7 +249,6 @@ def _decoder() -> Callable[[Path, list[float]], Tensor]:
 
 
 def _image_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
-    """Return the reader of a camera whose images are stored in the tables."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = LeRobotDataset(root.name, root=without_pattern(root))

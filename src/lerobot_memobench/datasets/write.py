@@ -321,7 +321,6 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
 
 
 def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
-    """Return the simulator's states, for replay; their width differs between tasks."""
     import pyarrow as pa
 
     length, width = states.shape
@@ -355,7 +354,7 @@ class ParquetFiles:
         self._writer.write_table(table)
 
     def size(self) -> int:
-        """Return the present size of the current file, bytes."""
+        """Return the bytes of the current file."""
         return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:
@@ -376,11 +375,11 @@ class ParquetFiles:
 
 
 def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
-    """Join the episodes' videos below the dataset's root; return each episode's place in them."""
+    """Join the episodes' videos below the dataset's root; return each episode's columns of meta/episodes."""
     from lerobot.datasets.io_utils import write_info
     from lerobot.datasets.utils import update_chunk_file_indices
 
-    places: list[dict[str, Any]] = [{} for _ in episodes]
+    columns: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
     for camera in episodes[0].content.image_stats:
         key, chunk, file = image_key(camera), 0, 0
@@ -393,7 +392,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
             frames = 0
             for i in group:
                 start, frames = frames, frames + videos[i][1]
-                places[i] |= {
+                columns[i] |= {
                     f"videos/{key}/chunk_index": chunk,
                     f"videos/{key}/file_index": file,
                     f"videos/{key}/from_timestamp": start / CONTROL_HZ,
@@ -402,7 +401,7 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
             chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
             meta.features[key].setdefault("info", video_info(path))
         write_info(meta.info, meta.root)
-    return places
+    return columns
 
 
 def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:

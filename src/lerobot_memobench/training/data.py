@@ -36,7 +36,7 @@ from lerobot_memobench.datasets.frames import (
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.layout import without_pattern
+from lerobot_memobench.datasets.layout import EPISODE_INFO, without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
@@ -132,7 +132,7 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
 
     Raises:
-        MemobenchError: the dataset lacks an episode, or an earlier version made it.
+        MemobenchError: the dataset lacks an episode, or another version made it.
     """
     opened = copy.copy(config)
     opened.dataset = replace(config.dataset)
@@ -145,11 +145,14 @@ def open_metadata(given: DatasetConfig) -> LeRobotDatasetMetadata:
     """Return the metadata of a training's dataset.
 
     Raises:
-        MemobenchError: the dataset lacks an episode, which LeRobot ignores, so that it fails if no episode is left.
+        MemobenchError: another version of this package wrote the dataset, or the dataset lacks an episode. LeRobot
+            ignores a missing episode and fails if none is left.
     """
     if given.root is not None:
         given.root = str(without_pattern(Path(given.root)))
     meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
+    if EPISODE_INFO in meta.features:
+        list_episodes(Path(meta.root))  # reads all records
     absent = [episode for episode in given.episodes or () if episode >= meta.total_episodes]
     if absent or given.episodes == []:
         raise MemobenchError(
