@@ -155,9 +155,12 @@ def test_chunks_end_at_a_hold(perception: str, tmp_path: Path) -> None:
     for start, end in STRETCHES:
         for frame in (start, end - 2, end - 1):
             there = min(4, end - frame)
-            assert samples[frame]["action_is_pad"].tolist() == [False] * there + [True] * (4 - there)
+            sample: dict[str, Any] = samples[frame]
+            assert sample["action_is_pad"].tolist() == [False] * there + [True] * (4 - there)
             whole = np.asarray(training.dataset.hf_dataset[frame : frame + there]["action"])
-            np.testing.assert_array_equal(samples[frame]["action"][:there], whole)
+            np.testing.assert_array_equal(sample["action"][:there], whole)
+            for name in ("observation.state", "episode_index", "task_index", "task"):
+                np.testing.assert_array_equal(sample[name], training.dataset[frame][name], name)
     if lookup.columns:
         actions = lookup.columns["action"].numpy()[ACTS]
         np.testing.assert_allclose(

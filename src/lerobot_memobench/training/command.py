@@ -185,7 +185,7 @@ def complete_training(asked: CommandSettings, notify: Callable[[str], None] = pr
     policy: Any = config.policy
     if getattr(policy, "type", None) == MEMORY_POLICY:
         check_settings(config)
-    validate(config, asked)
+    check_with_lerobot(config, asked)
     if config.checkpoint_path is not None:
         check_same_training(asked, config, config.checkpoint_path, notify)
     if policy is not None:
@@ -239,7 +239,7 @@ def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
     return replace(asked, words={**defaults, **asked.words})
 
 
-def validate(config: TrainPipelineConfig, asked: CommandSettings) -> None:
+def check_with_lerobot(config: TrainPipelineConfig, asked: CommandSettings) -> None:
     """Let LeRobot check a configuration and complete its folder, job, optimizer and resumed checkpoint.
 
     Raises:

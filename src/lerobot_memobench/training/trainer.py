@@ -41,7 +41,7 @@ from lerobot_memobench.training.features import cameras_of
 from lerobot_memobench.training.view import (
     SOURCE_EPISODE,
     cached_view,
-    is_of_benchmark,
+    has_benchmark_columns,
     needs_view,
     view_options,
 )
@@ -75,7 +75,7 @@ def prepare(
     check_inputs(policy, meta, features, config.rename_map)
     sizes = [tuple(features[name]["shape"][:2]) for name in cameras_of(features)]
     other = any(size != (IMAGE_SIZE, IMAGE_SIZE) for size in sizes)
-    if other and is_of_benchmark(meta.features) and keeps_sizes(policy):
+    if other and has_benchmark_columns(meta.features) and keeps_sizes(policy):
         height, width = sizes[0]
         notify(
             f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "

@@ -132,14 +132,14 @@ def view_options(
     return ViewOptions(prompts, seen)
 
 
-def is_of_benchmark(features: Mapping[str, Any]) -> bool:
+def has_benchmark_columns(features: Mapping[str, Any]) -> bool:
     """Return whether a dataset is the benchmark's, by its texts too: a phase alone may have another meaning."""
     return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {*features}
 
 
 def needs_view(features: Mapping[str, Any], options: ViewOptions) -> bool:
     """Return whether a dataset differs from its view, in the convention of the dataset."""
-    shortened = is_of_benchmark(features) and not options.prompts
+    shortened = has_benchmark_columns(features) and not options.prompts
     return shortened or options.columns(features) != {name: name for name in features}
 
 
@@ -170,7 +170,7 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
     features, fps = info["features"], info["fps"]
-    kept, mirrors, is_ours = options.columns(features), options.mirrors(features), is_of_benchmark(features)
+    kept, mirrors, is_ours = options.columns(features), options.mirrors(features), has_benchmark_columns(features)
     stretches = Stretches.of(table, is_ours and not options.prompts)
     if not stretches.starts.size:
         raise MemobenchError(f"{root} has no frame whose action has an effect; name a dataset of `memobench generate`")
