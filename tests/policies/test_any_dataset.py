@@ -185,6 +185,3 @@ def test_evaluation_between_updates_needs_the_datasets_inputs(
     words = ("policy=act", "policy.pretrained_backbone_weights=null", "env=memobench", "steps=1", "device=cpu")
     assert main(["train", *words, f"dataset={root}", f"output_dir={tmp_path / 'run'}"]) == 2
     assert re.search(f"{root}.*128 x 128", capsys.readouterr().err)
-
-
-# --- another environment ---

@@ -1,4 +1,4 @@
-"""The policy: training batches, rollouts of independent rows, real-time chunking, precision, checkpoints."""
+"""The policy: training batches, rollouts of independent rows, precision, checkpoints."""
 
 from __future__ import annotations
 
@@ -234,13 +234,6 @@ def test_rows_follow_their_clock(
     assert [k for k, (_, started, _) in enumerate(found) if started] == begins
     assert [k for k, (_, _, is_frozen) in enumerate(found) if is_frozen] == frozen
     assert written == [k for k in range(len(clocks)) if k not in frozen]
-
-
-def test_frozen_rows_are_not_written() -> None:
-    rollout, written = Rollout(remembers=True, stride=1), list[list[int]]()
-    for clocks in ([(1, 0), (1, 0)], [(1, 1), (1, 0)], [(1, 1), (1, 0)]):
-        rollout.observe(clocks, written.append)
-    assert written == [[0, 1], [0]]
 
 
 def test_unobserved_frames_are_noticed() -> None:
