@@ -355,8 +355,8 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
         A ``training`` batch has its own histories; its labels are not read.
         """
-        read = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
-        part = {key: value[rows] for key, value in batch.items() if key in read or key.startswith(ENCODED)}
+        inputs = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
+        part = {key: value[rows] for key, value in batch.items() if key in inputs or key.startswith(ENCODED)}
         seen, memory = self._observed(part), None
         with self.precision.computing(self._device):
             if training:

@@ -46,9 +46,11 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     STEPS,
     SUBGOAL,
     SUBGOALS,
+    TEXT,
+    TEXT_MASK,
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.texts import choices, embedded_texts, texts_of, words
+from lerobot_memobench.policies.memobench_mem.texts import choices, texts_of, words
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -227,12 +229,14 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
             return memory | found
-        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level))
-        if config.align != "framewise":
-            return memory | found | embedded_texts(lookup.text_embeddings, texts[torch.tensor([*indices])])
-        histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
-        padded = pad_sequence(histories, batch_first=True, padding_value=-1)
-        return memory | found | embedded_texts(lookup.text_embeddings, padded)
+        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level)).long()
+        if config.align == "framewise":
+            histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
+            asked_texts = pad_sequence(histories, batch_first=True, padding_value=-1)
+        else:
+            asked_texts = texts[torch.tensor([*indices])]
+        embedded = lookup.text_embeddings[asked_texts.clamp(min=0)]
+        return memory | found | {TEXT: embedded, TEXT_MASK: asked_texts >= 0}
 
     def get_config(self) -> dict[str, Any]:
         """Return the saved settings."""

@@ -19,7 +19,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 from lerobot_memobench.tasks.memory_text import MARK
 
 logger = logging.getLogger(__name__)
@@ -229,11 +228,3 @@ def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncod
     """Build a text encoder: ``words``, ``labels``, or the folder or repository of a SigLIP model."""
     built_in = {"words": WordTextEncoder, "labels": LabelTextEncoder}
     return built_in[name](dim) if name in built_in else SiglipTextEncoder(name, dim, device)
-
-
-def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
-    """Return the texts (..., d_t) of frames and their mask (...), as inputs of `losses.alignment_loss`.
-
-    ``embeddings`` (T, d_t) are those of all texts; ``rows`` (...) is the row of each frame's text, -1 for none.
-    """
-    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.long().clamp(min=0)]}

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 GROUP = "lerobot_memobench.memories"
 NONE = "none"
 OURS = {
-    "frames": "Frames",
+    "frames": "FrameSampling",
     "bank": "Bank",
     "motion": "Motion",
     "subgoal": "Subgoal",

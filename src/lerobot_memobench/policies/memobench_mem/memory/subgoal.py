@@ -15,7 +15,7 @@ from einops import repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ class NarrowChannel(MemoryFusion):
         return NarrowPass(self.model, memory, watched)
 
 
-class Subgoal(Frames):
+class Subgoal(FrameSampling):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
     As in the source: cross-entropy of the text with weight 1 next to the actions' loss; the expert is trained on states
