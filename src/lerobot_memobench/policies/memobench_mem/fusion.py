@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -167,9 +167,9 @@ class MemoryFusion(ABC):
     reports_reads: ClassVar[bool] = False
     parts: ClassVar[tuple[str, ...]] = ()
 
-    @abstractmethod
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         """Prepare ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+        self.model = model
 
     @abstractmethod
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
@@ -240,7 +240,7 @@ class MemoryModulator(nn.Module):
         A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
         ``found``.
         """
-        weights: list[Tensor] | None = None if found is None else []
+        weights = None if found is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
         # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
@@ -282,15 +282,14 @@ class Modulation(MemoryFusion):
     parts = ("memory_to_expert.", "modulators.")
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
+        super().__init__(model, memory_dim, expert_dim)
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         layers = model.paligemma_with_expert.gemma_expert.model.layers
         model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Project the memory to the expert's width."""
-        projected = memory.map(cast(nn.Linear, self.model.memory_to_expert))
-        return ModulationPass(projected, [*self.model.modulators], watched)
+        return ModulationPass(memory.map(self.model.memory_to_expert), [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------
@@ -323,9 +322,6 @@ class Context(MemoryFusion):
     """Append memory tokens to the prefix, to which the actions attend; the model gets no further parameters."""
 
     reports_reads = True
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        pass
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory."""

@@ -98,10 +98,10 @@ class Foresight(MemoryFusion):
 
     parts = ("foresight.",)
 
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
-        self.model = cast(Any, model)
-        pool = self.model.memory.pool
-        self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
+        super().__init__(model, memory_dim, expert_dim)
+        pool = model.memory.pool
+        model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass conditioned on this memory."""

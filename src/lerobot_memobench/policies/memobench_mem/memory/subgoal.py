@@ -7,7 +7,7 @@ text follow the prefix, attend to all of it, and are all that the action expert 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,9 +17,6 @@ from torch import Tensor, nn
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
-
-if TYPE_CHECKING:
-    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 SCORES = "memory.scores"
 
@@ -98,11 +95,11 @@ class NarrowPass(MemoryPass):
 
     watches = ("prefix",)
 
-    def __init__(self, model: MemoryPI05, memory: MemoryTokens, watched: bool) -> None:
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool) -> None:
         super().__init__(watched)
         assert memory.query is not None
         self.model, self.memory, self.query = model, memory, memory.query
-        self.choice = cast(SubgoalChoice, model.subgoal)
+        self.choice: SubgoalChoice = model.subgoal
         self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
@@ -161,9 +158,8 @@ class NarrowChannel(MemoryFusion):
     reports_reads = True
     parts = ("subgoal.",)
 
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
-        assert model.memory is not None
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
+        super().__init__(model, memory_dim, expert_dim)
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
