@@ -73,6 +73,7 @@ def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[
     flat, bias = query.reshape(rows, count * heads, width), bias.to(query.dtype)
     if bias.shape[1] > 1:
         bias = bias.repeat_interleave(heads, dim=1)
+    # On a CPU a plan has few queries: stored scores are faster then, and actions of recorded evaluations stay the same.
     if found is None and (query.is_cuda or torch.is_grad_enabled()):
         mask = bias.expand(-1, count * heads, -1)[:, None]
         read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)

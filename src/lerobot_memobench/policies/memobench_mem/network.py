@@ -441,9 +441,6 @@ class Precision:
     A bfloat16 weight near 1 has steps of 1/128, so updates at a learning rate of 5e-5 would round to zero. As in the
     reference implementation of pi0.5, trained weights are float32 and autocast rounds them for each pass. Frozen
     weights, and all weights of a policy that only acts, keep LeRobot's bfloat16.
-
-    Args:
-        parameters: all of the module's, as cast by LeRobot.
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:

@@ -58,12 +58,10 @@ class RememberedFrame:
 
 @dataclass
 class FrameSamplingSettings:
-    """Settings of `FrameSampling`.
+    """Settings of `FrameSampling`: the most ``frames`` that a chunk reads, and whether tokens have ``content``.
 
-    Attributes:
-        frames: maximum number of frames that a chunk reads.
-        content: whether tokens hold the observation. If false, they hold only their time: the clock-only control of
-            `docs/guides/controls.md`; with ``memory_phase``, also the phase.
+    Without content they hold only their time: the clock-only control of `docs/guides/controls.md`; with
+    ``memory_phase``, also the phase.
     """
 
     frames: int = 32

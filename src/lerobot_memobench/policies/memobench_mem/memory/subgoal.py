@@ -86,11 +86,7 @@ class NarrowPass(MemoryPass):
     the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
     the instruction.
 
-    In training the text is the true one; otherwise a pass over the prefix, which does not depend on later tokens,
-    chooses it.
-
-    Attributes:
-        chosen: (B,) index of the text in the prefix; S: the empty text.
+    In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen`` (B,), S: none).
     """
 
     watches = ("prefix",)
