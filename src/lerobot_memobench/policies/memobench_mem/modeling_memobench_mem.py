@@ -336,10 +336,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         with self.precision.computing(self._device):
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that they are independent
                 env = self.rollout.envs[row]
-                repeated = env.memory is not None and env.stored is not None and torch.equal(frame, env.stored)
-                env.stored = frame
-                if repeated and skips:
+                if skips and env.memory is not None and env.stored is not None and torch.equal(frame, env.stored):
                     continue
+                env.stored = frame
                 query = self._query(batch, [row], writes=True)
                 state = memory.init(1) if env.memory is None else env.memory
                 env.memory = memory.observe(state, frame, torch.tensor([env.position], device=self._device), query)

@@ -371,14 +371,13 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
 
 
 _warned: set[str] = set()
-"""Texts, instructions and words about which this process has logged a warning."""
+"""Prompts, instructions and words about which this process has logged a warning."""
 
 
 def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
     """Warn about unknown words of a prompt, each once per process, and about cut prompts, once per instruction.
 
-    Args:
-        full: whether the prompt fills ``max_length`` tokens, so that it may have been cut.
+    A prompt that is ``full`` may have been cut.
     """
     prompt = text.partition(", State: ")[0]
     instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
@@ -386,27 +385,21 @@ def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> No
         return
     coded = tokenizer(text, return_offsets_mapping=True)
     spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
-    unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
-    new = [repr(word) for word in unknown if f"word {word}" not in _warned]
-    if new:
+    unknown = {text[a:b].lower(): None for token, (a, b) in spans if token == tokenizer.unk_token_id}
+    if new := [repr(word) for word in unknown if f"word {word}" not in _warned]:
         logger.warning(
             "unknown words %s in %r: the policy reads all unknown words alike; train it on instructions with these "
             "words",
-            ", ".join(new),
-            instruction,
+            *(", ".join(new), instruction),
         )
     if len(spans) > max_length and f"cut {instruction}" not in _warned:
         logger.warning(
-            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its "
-            "training); cut off: %r",
-            instruction,
-            len(spans),
-            max_length,
-            text[spans[max_length][1][0] :],
+            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its training); cut "
+            "off: %r",
+            *(instruction, len(spans), max_length, text[spans[max_length][1][0] :]),
         )
         _warned.add(f"cut {instruction}")
-    _warned.update(f"word {word}" for word in unknown)
-    _warned.add(f"read {prompt}")
+    _warned.update([f"read {prompt}", *(f"word {word}" for word in unknown)])
 
 
 @dataclass
