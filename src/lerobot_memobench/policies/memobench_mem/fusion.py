@@ -61,12 +61,12 @@ def hidden(real: Tensor) -> Tensor:
     return torch.where(real, 0.0, torch.finfo(torch.float32).min / 2)
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[Tensor] | None = None) -> Tensor:
+def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, collected: list[Tensor] | None = None) -> Tensor:
     """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
 
     Args:
         bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
-        found: a list to which the attention weights (B, H, N, M) are appended.
+        collected: a list to which the attention weights (B, H, N, M) are appended.
     """
     rows, count, heads, width = query.shape
     # All heads share keys and values, so heads are further queries of one product.
@@ -74,14 +74,14 @@ def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[
     if bias.shape[1] > 1:
         bias = bias.repeat_interleave(heads, dim=1)
     # On a CPU a plan has few queries: stored scores are faster then, and actions of recorded evaluations stay the same.
-    if found is None and (query.is_cuda or torch.is_grad_enabled()):
+    if collected is None and (query.is_cuda or torch.is_grad_enabled()):
         mask = bias.expand(-1, count * heads, -1)[:, None]
         read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
         return read.view(rows, count, heads * width)
     scores = torch.baddbmm(bias, flat, key.transpose(1, 2), alpha=width**-0.5)
     weights = scores.softmax(dim=-1, dtype=torch.float32)
-    if found is not None:
-        found.append(weights.unflatten(1, (count, heads)).transpose(1, 2))
+    if collected is not None:
+        collected.append(weights.unflatten(1, (count, heads)).transpose(1, 2))
     return torch.bmm(weights.to(value.dtype), value).view(rows, count, heads * width)
 
 
@@ -234,20 +234,20 @@ class MemoryModulator(nn.Module):
         return rotate_from(key, 0), value
 
     def forward(
-        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], found: list[Tensor] | None = None
+        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], collected: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
         A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
-        ``found``.
+        ``collected``.
         """
-        weights = None if found is None else list[Tensor]()
+        weights = None if collected is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
         # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
-        if found is not None and weights is not None:
-            found.append(weights[0].mean(dim=(1, 2)) * memory.mask)
+        if collected is not None and weights is not None:
+            collected.append(weights[0].mean(dim=(1, 2)) * memory.mask)
         read = read * memory.mask.any(dim=1)[:, None, None]
         scale, shift = self.modulation(self.out(read)).chunk(2, dim=-1)
         return scale, shift

@@ -242,9 +242,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         drawn = noise_and_time(self.config.objective, actions)
         squared = self.model.forward(seen, actions, *drawn, memory)[:, :, : self._action_dim]
         losses = losses_of(self.config.objective, squared)
-        found = mean_losses(losses, counted_actions(batch, losses))
-        logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
-        return found.per_sample, found.mean, logged
+        loss = mean_losses(losses, counted_actions(batch, losses))
+        logged = {"action_loss": loss.mean.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
+        return loss.per_sample, loss.mean, logged
 
     # -- acting ----------------------------------------------------------------------------------------------------
 

@@ -37,11 +37,11 @@ def texts_of(subgoals: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 def subgoals_of(texts: Sequence[str], episodes: np.ndarray, tasks: Iterable[Iterable[str]]) -> dict[str, list[str]]:
     """Return instruction -> sorted texts of its checkpoints, given the instructions of each episode."""
-    found = dict[str, set[str]]()
+    by_task = dict[str, set[str]]()
     for instructions, own in zip(tasks, _of_episodes(texts, episodes), strict=True):
         for task in instructions:
-            found.setdefault(str(task), set()).update(filter(None, own))
-    return {task: sorted(own) for task, own in sorted(found.items())}
+            by_task.setdefault(str(task), set()).update(filter(None, own))
+    return {task: sorted(own) for task, own in sorted(by_task.items())}
 
 
 def _of_episodes(texts: Sequence[str], episodes: np.ndarray) -> list[Sequence[str]]:

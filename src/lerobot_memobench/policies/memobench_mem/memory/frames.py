@@ -157,8 +157,8 @@ class FrameSampling(MemoryMechanism):
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
         each = self._encoded(histories.frames, histories.steps)
-        found = self._tokens(each, real, histories.steps[places])
-        return found._replace(places=places)
+        tokens = self._tokens(each, real, histories.steps[places])
+        return tokens._replace(places=places)
 
     def _encoded(self, frames: Tensor, steps: Tensor) -> Tensor:
         """Return memory tokens (N, P, d_m) of stored frames (N, P', D') at control steps (N,)."""

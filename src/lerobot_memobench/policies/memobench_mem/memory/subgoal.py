@@ -140,12 +140,12 @@ class NarrowPass(MemoryPass):
         assert self.chosen is not None
         _, real = self.choice.texts(self.chosen)
         words, length = real.shape[1], self.memory.mask.shape[1]
-        of_prefix, found = self.attention["prefix"], []
+        of_prefix, shares = self.attention["prefix"], []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
             unread = weights.shape[2] - words - (self.model.state_token is not None)
             read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
-            found.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
-        return found
+            shares.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
+        return shares
 
 
 class NarrowChannel(MemoryFusion):
