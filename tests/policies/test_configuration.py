@@ -148,8 +148,8 @@ class OneMore(MemobenchMemConfig):
 def test_a_setting_is_one_field() -> None:
     assert {"repetitions", "colour"} <= {*OneMore(device="cpu", repetitions=2, colour="red").fixed_by_training}
     for fields, named in (
-        ({"repetitions": 2, "memory": "none"}, "repetitions=2 has no effect: only a memory reads it"),
-        ({"repetitions": 0}, "repetitions=0 is out of range"),
+        ({"repetitions": 2, "memory": "none"}, "repetitions=2.*memory"),
+        ({"repetitions": 0}, "repetitions=0"),
         ({"colour": "rd"}, "colour 'rd'.*red"),
     ):
         with pytest.raises(MemobenchError, match=named):

@@ -10,7 +10,7 @@ import torch
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
-from tests.policies.test_memory import assert_same, made, present, rolled_out
+from tests.policies.test_memory import assert_same, made, present
 
 ROWS, STRIDE, LENGTH = 3, 4, 12
 
@@ -88,11 +88,3 @@ def test_noise_changes_what_a_row_reads_and_no_other(rolled: Rolled) -> None:
     rolled.rollout.envs[1].memory = rolled.rollout.envs[1].intact
     rolled.rollout.corrupt([1], noised)
     assert_same(rolled.read(1), first)
-
-
-def test_a_rollout_writes_as_the_policy_does() -> None:
-    rolled = Rolled("recurrent")
-    with torch.no_grad():
-        rolled.act(range(LENGTH))
-        state = rolled_out(rolled.mechanism, rolled.frames[0, :LENGTH:STRIDE], STRIDE, rolled.query.rows([0]))
-        assert_same(rolled.read(0), rolled.mechanism.read(state, rolled.query.rows([0])))

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from benchmarks.random_weights import random_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frame
+from lerobot_memobench.policies.memobench_mem.memory.frames import RememberedFrame
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory
@@ -61,7 +61,7 @@ def _memory(batch: dict[str, Tensor]) -> Histories:
 def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
     """Return a plan in the middle of an episode with 32 remembered frames."""
     seen = _memory(batch)
-    kept = [Frame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
+    kept = [RememberedFrame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
     policy.reset()
     policy.rollout.envs = [EnvMemory(clock=(1, kept[-1].step), position=kept[-1].step, memory=[kept])]
     keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)

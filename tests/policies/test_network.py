@@ -159,25 +159,6 @@ def test_memory_changes_actions_and_padding_does_not(memory_fusion: str) -> None
     assert torch.isfinite(_actions(ours, inputs, memory)).all()
 
 
-def test_heads_share_keys() -> None:
-    """Attention with stored scores and by torch's kernel equals attention per head, with its gradients."""
-    torch.manual_seed(0)
-    parts = [torch.randn(shape, requires_grad=True) for shape in ((2, 5, 8, 4), (2, 7, 4), (2, 7, 4))]
-    for seen in (torch.arange(7) < torch.tensor([[[7]], [[2]]]), torch.rand(2, 5, 7) < 0.6):
-        bias = fusion.hidden(seen)
-        query, key, value = parts
-        scores = torch.einsum("bnhd,bmd->bhnm", query, key) / 2 + bias.unsqueeze(1)
-        alone = torch.einsum("bhnm,bmd->bnhd", scores.softmax(dim=-1), value).flatten(2)
-        found = fusion.attend(query, key, value, bias)
-        torch.testing.assert_close(found, alone)
-        with torch.no_grad():
-            torch.testing.assert_close(fusion.attend(query, key, value, bias), alone)
-        along = torch.randn_like(found)
-        expected = torch.autograd.grad(alone, parts, along)
-        for ours, of_each in zip(torch.autograd.grad(found, parts, along), expected, strict=True):
-            torch.testing.assert_close(ours, of_each)
-
-
 def test_instruction_conditions_norms_without_its_padding() -> None:
     config = _config(size="small", perception="objects")
     torch.manual_seed(0)

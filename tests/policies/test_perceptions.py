@@ -30,7 +30,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem import objects
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, PLACES
@@ -517,21 +516,3 @@ def test_errors_are_drawn_once_per_frame() -> None:
     assert not torch.equal(first[FRAMES], second[FRAMES])
     without = {name: one for name, one in batch.items() if name != FRAMES}
     assert perception.observed(without).keys() == without.keys()
-
-
-@pytest.mark.parametrize("memory", ["bank", pytest.param("motion", marks=pytest.mark.slow)])
-def test_frames_share_their_errors(root: Path, monkeypatch: pytest.MonkeyPatch, memory: str) -> None:
-    drawn: list[int] = []
-
-    def counted(slots: torch.Tensor, hand: torch.Tensor, size: float) -> torch.Tensor:
-        drawn.append(len(slots))
-        return with_detection_noise(slots, hand, size)
-
-    monkeypatch.setattr(objects, "with_detection_noise", counted)
-    settings = {"size": "small", "perception": "objects", "memory_stride": 8}
-    policy, before, _, dataset = made_for_training(root, memory=memory, detection_noise=1.0, **settings)
-    batch = before(batch_of(dataset, [16] * 16))
-    policy.train().forward(batch)
-    assert drawn == [len(batch[FRAMES])]
-    policy.eval().forward(batch)
-    assert len(drawn) == 1

@@ -163,34 +163,35 @@ def test_chunks_end_at_a_hold(perception: str, tmp_path: Path) -> None:
                 np.testing.assert_array_equal(sample[name], training.dataset[frame][name], name)
     if lookup.columns:
         actions = lookup.columns["action"].numpy()[ACTS]
-        np.testing.assert_allclose(
-            execution_statistics(lookup)["action"]["mean"],
-            actions.mean(axis=0),
-            atol=1e-6,
-        )
+        mean = execution_statistics(lookup)["action"]["mean"]
+        np.testing.assert_allclose(mean, actions.mean(axis=0), atol=1e-6)
 
 
 def test_processes_draw_different_noise_of_the_same_policy(
     objects: Path, tmp_path: Path, train: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn: list[tuple[float, float]] = []
-    draw = modeling.noise_and_time
+    drawn: list[float] = []
+    draw, forward = modeling.noise_and_time, modeling.MemobenchMemPolicy.forward
+    weights: list[float] = []
 
-    def noted(objective: str, model: Any, actions: torch.Tensor) -> Any:
-        noise, time = draw(objective, model, actions)
-        weights = sum(parameter.sum().item() for parameter in model.parameters())
-        drawn.append((noise.sum().item(), weights))
+    def noted(objective: str, actions: torch.Tensor) -> Any:
+        noise, time = draw(objective, actions)
+        drawn.append(noise.sum().item())
         assert torch.get_float32_matmul_precision() != "medium", "dtype sets the precision, not the processor"
         return noise, time
 
+    def weighed(policy: Any, *arguments: Any, **named: Any) -> Any:
+        weights.append(sum(parameter.sum().item() for parameter in policy.parameters()))
+        return forward(policy, *arguments, **named)
+
     monkeypatch.setattr(modeling, "noise_and_time", noted)
+    monkeypatch.setattr(modeling.MemobenchMemPolicy, "forward", weighed)
     words = ("policy=memobench_mem", "perception=objects", "size=tiny", "batch_size=8", "policy.chunk_size=4")
     for rank in (0, 1):
         monkeypatch.setattr(Accelerator, "process_index", property(lambda _, rank=rank: rank))
         train(*words, f"dataset={objects}", f"output_dir={tmp_path / str(rank)}", "steps=1", "save_checkpoint=false")
-    (first, weights), (second, others) = drawn
-    assert first != second
-    assert weights == others
+    assert drawn[0] != drawn[1]
+    assert weights[0] == weights[1]
 
 
 def test_augmentation_follows_seed_and_draw(synthetic: Path) -> None:

@@ -36,13 +36,13 @@ _EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
     """Return the configuration to load a checkpoint with: ``config``, or the checkpoint's own."""
     check_processors(source, revision)
-    found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
-    if not isinstance(found, MemobenchMemConfig):
+    loaded = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
+    if not isinstance(loaded, MemobenchMemConfig):
         raise MemobenchError(
-            f"'{source}' is a '{found.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
+            f"'{source}' is a '{loaded.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
             "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
         )
-    return found
+    return loaded
 
 
 def has_another_memory(config: MemobenchMemConfig, trained: MemobenchMemConfig) -> bool:
@@ -128,12 +128,12 @@ def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
     """Return the weights whose names start with ``prefix``, without a leading ``model.`` and the prefix."""
     path = weights_file(source)
     with undamaged(path), safe_open(path, framework="pt") as tensors:
-        found = {}
+        weights = {}
         for name in tensors.keys():  # noqa: SIM118 (not a dict)
             short = name.removeprefix("model.")
             if short.startswith(prefix):
-                found[short.removeprefix(prefix)] = tensors.get_tensor(name)
-    return found
+                weights[short.removeprefix(prefix)] = tensors.get_tensor(name)
+    return weights
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:

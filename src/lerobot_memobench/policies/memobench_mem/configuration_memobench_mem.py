@@ -425,7 +425,8 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def fixed_by_training(self) -> tuple[str, ...]:
-        """Fields that must keep their values when a checkpoint acts or its training is resumed, ours first."""
+        """Fields that must keep their values when a checkpoint acts or its training is resumed."""
+        # Ours first, because another setting is the cause of other inputs.
         inherited = [one.name for one in fields(PreTrainedConfig)]
         names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
         return tuple(sorted(names, key=inherited.__contains__))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -61,26 +61,27 @@ def hidden(real: Tensor) -> Tensor:
     return torch.where(real, 0.0, torch.finfo(torch.float32).min / 2)
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, found: list[Tensor] | None = None) -> Tensor:
+def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, collected: list[Tensor] | None = None) -> Tensor:
     """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
 
     Args:
         bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
-        found: a list to which the attention weights (B, H, N, M) are appended.
+        collected: a list to which the attention weights (B, H, N, M) are appended.
     """
     rows, count, heads, width = query.shape
     # All heads share keys and values, so heads are further queries of one product.
     flat, bias = query.reshape(rows, count * heads, width), bias.to(query.dtype)
     if bias.shape[1] > 1:
         bias = bias.repeat_interleave(heads, dim=1)
-    if found is None and (query.is_cuda or torch.is_grad_enabled()):
+    # On a CPU a plan has few queries: stored scores are faster then, and actions of recorded evaluations stay the same.
+    if collected is None and (query.is_cuda or torch.is_grad_enabled()):
         mask = bias.expand(-1, count * heads, -1)[:, None]
         read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
         return read.view(rows, count, heads * width)
     scores = torch.baddbmm(bias, flat, key.transpose(1, 2), alpha=width**-0.5)
     weights = scores.softmax(dim=-1, dtype=torch.float32)
-    if found is not None:
-        found.append(weights.unflatten(1, (count, heads)).transpose(1, 2))
+    if collected is not None:
+        collected.append(weights.unflatten(1, (count, heads)).transpose(1, 2))
     return torch.bmm(weights.to(value.dtype), value).view(rows, count, heads * width)
 
 
@@ -167,9 +168,9 @@ class MemoryFusion(ABC):
     reports_reads: ClassVar[bool] = False
     parts: ClassVar[tuple[str, ...]] = ()
 
-    @abstractmethod
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         """Prepare ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+        self.model = model
 
     @abstractmethod
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
@@ -233,20 +234,20 @@ class MemoryModulator(nn.Module):
         return rotate_from(key, 0), value
 
     def forward(
-        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], found: list[Tensor] | None = None
+        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], collected: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
         A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
-        ``found``.
+        ``collected``.
         """
-        weights: list[Tensor] | None = None if found is None else []
+        weights = None if collected is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
         # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
-        if found is not None and weights is not None:
-            found.append(weights[0].mean(dim=(1, 2)) * memory.mask)
+        if collected is not None and weights is not None:
+            collected.append(weights[0].mean(dim=(1, 2)) * memory.mask)
         read = read * memory.mask.any(dim=1)[:, None, None]
         scale, shift = self.modulation(self.out(read)).chunk(2, dim=-1)
         return scale, shift
@@ -282,15 +283,14 @@ class Modulation(MemoryFusion):
     parts = ("memory_to_expert.", "modulators.")
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
+        super().__init__(model, memory_dim, expert_dim)
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         layers = model.paligemma_with_expert.gemma_expert.model.layers
         model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Project the memory to the expert's width."""
-        projected = memory.map(cast(nn.Linear, self.model.memory_to_expert))
-        return ModulationPass(projected, [*self.model.modulators], watched)
+        return ModulationPass(memory.map(self.model.memory_to_expert), [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------
@@ -323,9 +323,6 @@ class Context(MemoryFusion):
     """Append memory tokens to the prefix, to which the actions attend; the model gets no further parameters."""
 
     reports_reads = True
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        pass
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory."""

@@ -242,9 +242,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         drawn = noise_and_time(self.config.objective, actions)
         squared = self.model.forward(seen, actions, *drawn, memory)[:, :, : self._action_dim]
         losses = losses_of(self.config.objective, squared)
-        found = mean_losses(losses, counted_actions(batch, losses))
-        logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
-        return found.per_sample, found.mean, logged
+        loss = mean_losses(losses, counted_actions(batch, losses))
+        logged = {"action_loss": loss.mean.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
+        return loss.per_sample, loss.mean, logged
 
     # -- acting ----------------------------------------------------------------------------------------------------
 
@@ -336,10 +336,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         with self.precision.computing(self._device):
             for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that they are independent
                 env = self.rollout.envs[row]
-                repeated = env.memory is not None and env.stored is not None and torch.equal(frame, env.stored)
-                env.stored = frame
-                if repeated and skips:
+                if skips and env.memory is not None and env.stored is not None and torch.equal(frame, env.stored):
                     continue
+                env.stored = frame
                 query = self._query(batch, [row], writes=True)
                 state = memory.init(1) if env.memory is None else env.memory
                 env.memory = memory.observe(state, frame, torch.tensor([env.position], device=self._device), query)

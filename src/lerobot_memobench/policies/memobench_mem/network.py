@@ -161,16 +161,16 @@ class MemoryPI05(nn.Module):
     def read_prefix(self, prefix: Prefix, memory: MemoryPass) -> PrefixKeys:
         """Return each layer's keys and values of a prefix; pass the last states of `Prefix.asked` to ``memory``."""
         model = self.paligemma_with_expert.paligemma.model.language_model
-        real, found = prefix.real, memory.attention.get("prefix")
+        real, collected = prefix.real, memory.attention.get("prefix")
         turned = rotary(torch.cumsum(real, dim=1) - 1, model.rotary_emb.inv_freq)
         seen = real[:, None] if prefix.attends is None else prefix.attends & real[:, None]
         x, kept, last = _narrowed(prefix.tokens, model), [], len(model.layers) - 1
         for number, layer in enumerate(model.layers):
-            asked = slice(None) if number < last or found is not None else prefix.asked
-            x, *keys = self._call_layer(_prefix_layer, layer, x, turned, hidden(seen), asked, found)
+            asked = slice(None) if number < last or collected is not None else prefix.asked
+            x, *keys = self._call_layer(_prefix_layer, layer, x, turned, hidden(seen), asked, collected)
             kept.append((keys[0][:, prefix.unread :], keys[1][:, prefix.unread :]))
         if prefix.asked is not None:
-            states = rms_norm(x[:, prefix.asked] if found is not None else x)
+            states = rms_norm(x[:, prefix.asked] if collected is not None else x)
             memory.read_out(states * (1.0 + model.norm.weight.float()))
         return PrefixKeys(kept, hidden(real[:, None, prefix.unread :]), real.sum(dim=1, keepdim=True))
 
@@ -212,8 +212,8 @@ class MemoryPI05(nn.Module):
         prefix = self.embed(seen, memory)
         past = self.read_prefix(prefix, memory)
         modulations = self.modulations(time, prefix.instruction, memory)
-        found = self.velocity(at * noise + (1 - at) * actions, modulations, past, memory)
-        return F.mse_loss(noise - actions, found, reduction="none")
+        velocity = self.velocity(at * noise + (1 - at) * actions, modulations, past, memory)
+        return F.mse_loss(noise - actions, velocity, reduction="none")
 
     @torch.no_grad()
     def sample_actions(self, seen: Observation, noise: Tensor, memory: MemoryPass | None = None) -> Tensor:
@@ -322,7 +322,7 @@ def _projected(attention: Any, x: Tensor, turned: Tensor) -> Tensor:
 
 
 def _prefix_layer(
-    layer: Any, x: Tensor, turned: Tensor, bias: Tensor, asked: slice | None, found: list[Tensor] | None
+    layer: Any, x: Tensor, turned: Tensor, bias: Tensor, asked: slice | None, collected: list[Tensor] | None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the next states of the ``asked`` tokens, and keys and values of all tokens."""
     attention = layer.self_attn
@@ -331,7 +331,7 @@ def _prefix_layer(
     if asked is None:
         return x, key, value
     query = _projected(attention, normed[:, asked], turned[:, asked])
-    read = attend(query, key, value, bias if bias.shape[1] == 1 else bias[:, asked], found)
+    read = attend(query, key, value, bias if bias.shape[1] == 1 else bias[:, asked], collected)
     x = x[:, asked] + attention.o_proj(read)
     normed = (rms_norm(x) * (1.0 + layer.post_attention_layernorm.weight.float())).to(x.dtype)
     return x + layer.mlp(normed), key, value
@@ -349,11 +349,11 @@ def _action_layer(
     memory: MemoryPass,
 ) -> Tensor:
     """Return the next states (B, T, W) of the expert's tokens, given the modulations of both norms."""
-    attention, found = layer.self_attn, memory.attention.get("actions")
+    attention, collected = layer.self_attn, memory.attention.get("actions")
     normed, gate = modulated(x, before)
     own = rotate(attention.k_proj(normed), turned), attention.v_proj(normed)
     key, value = (torch.cat([of_past, here], dim=1) for of_past, here in zip(past, own, strict=True))
-    read = attention.o_proj(attend(_projected(attention, normed, turned), key, value, bias, found))
+    read = attention.o_proj(attend(_projected(attention, normed, turned), key, value, bias, collected))
     x = torch.addcmul(x, read, gate)
     normed = rms_norm(x)
     inputs, gate = scaled_and_shifted(normed, after)
@@ -441,9 +441,6 @@ class Precision:
     A bfloat16 weight near 1 has steps of 1/128, so updates at a learning rate of 5e-5 would round to zero. As in the
     reference implementation of pi0.5, trained weights are float32 and autocast rounds them for each pass. Frozen
     weights, and all weights of a policy that only acts, keep LeRobot's bfloat16.
-
-    Args:
-        parameters: all of the module's, as cast by LeRobot.
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:

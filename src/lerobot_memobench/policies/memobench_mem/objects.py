@@ -272,8 +272,8 @@ class DetectionEncoder(ObjectEncoder):
         return super().remember(self._with_objects(chosen), range(len(rows)))
 
     def _with_objects(self, batch: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        found = batch[DETECTED] if DETECTED in batch else self.detect(batch, batch[OBS_RAW_STATE])
-        return {**batch, OBS_ENV_STATE: found}
+        slots = batch[DETECTED] if DETECTED in batch else self.detect(batch, batch[OBS_RAW_STATE])
+        return {**batch, OBS_ENV_STATE: slots}
 
 
 # -- detection noise ---------------------------------------------------------------------------------------------------

@@ -46,9 +46,11 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     STEPS,
     SUBGOAL,
     SUBGOALS,
+    TEXT,
+    TEXT_MASK,
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.texts import choices, embedded_texts, texts_of, words
+from lerobot_memobench.policies.memobench_mem.texts import choices, texts_of, words
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -137,8 +139,8 @@ class LookupProcessorStep(ProcessorStep):
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return None
-        found: list[int] = extra["index"].reshape(-1).tolist()
-        return found
+        indices: list[int] = extra["index"].reshape(-1).tolist()
+        return indices
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -204,10 +206,10 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         config = self.config
         assert config is not None
         places = [lookup.locate(index) for index in indices]
-        found = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
-        found |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
+        features = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
+        features |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
         if config.memory == NONE:
-            return found
+            return features
         mechanism, stride, settings = find_mechanism(config.memory), lookup.stride, self._settings
 
         def slots(episode: int, last: int) -> np.ndarray:
@@ -226,13 +228,15 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
-            return memory | found
-        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level))
-        if config.align != "framewise":
-            return memory | found | embedded_texts(lookup.text_embeddings, texts[torch.tensor([*indices])])
-        histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
-        padded = pad_sequence(histories, batch_first=True, padding_value=-1)
-        return memory | found | embedded_texts(lookup.text_embeddings, padded)
+            return memory | features
+        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level)).long()
+        if config.align == "framewise":
+            histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
+            asked_texts = pad_sequence(histories, batch_first=True, padding_value=-1)
+        else:
+            asked_texts = texts[torch.tensor([*indices])]
+        embedded = lookup.text_embeddings[asked_texts.clamp(min=0)]
+        return memory | features | {TEXT: embedded, TEXT_MASK: asked_texts >= 0}
 
     def get_config(self) -> dict[str, Any]:
         """Return the saved settings."""
@@ -255,17 +259,17 @@ def _histories(
     first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
 
     def places(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
-        found = np.full((len(wanted), width), -1)
+        indices = np.full((len(wanted), width), -1)
         for row, (episode, slots) in enumerate(wanted):
-            found[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
-        return torch.from_numpy(found)
+            indices[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
+        return torch.from_numpy(indices)
 
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
     starts = np.repeat([lookup.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
     frames = torch.cat([lookup.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
-    found = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
-    found |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
-    return found, steps + torch.from_numpy(starts)
+    histories = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
+    histories |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
+    return histories, steps + torch.from_numpy(starts)
 
 
 @dataclass
@@ -367,14 +371,13 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
 
 
 _warned: set[str] = set()
-"""Texts, instructions and words about which this process has logged a warning."""
+"""Prompts, instructions and words about which this process has logged a warning."""
 
 
 def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
     """Warn about unknown words of a prompt, each once per process, and about cut prompts, once per instruction.
 
-    Args:
-        full: whether the prompt fills ``max_length`` tokens, so that it may have been cut.
+    A prompt that is ``full`` may have been cut.
     """
     prompt = text.partition(", State: ")[0]
     instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
@@ -382,27 +385,21 @@ def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> No
         return
     coded = tokenizer(text, return_offsets_mapping=True)
     spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
-    unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
-    new = [repr(word) for word in unknown if f"word {word}" not in _warned]
-    if new:
+    unknown = {text[a:b].lower(): None for token, (a, b) in spans if token == tokenizer.unk_token_id}
+    if new := [repr(word) for word in unknown if f"word {word}" not in _warned]:
         logger.warning(
             "unknown words %s in %r: the policy reads all unknown words alike; train it on instructions with these "
             "words",
-            ", ".join(new),
-            instruction,
+            *(", ".join(new), instruction),
         )
     if len(spans) > max_length and f"cut {instruction}" not in _warned:
         logger.warning(
-            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its "
-            "training); cut off: %r",
-            instruction,
-            len(spans),
-            max_length,
-            text[spans[max_length][1][0] :],
+            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its training); cut "
+            "off: %r",
+            *(instruction, len(spans), max_length, text[spans[max_length][1][0] :]),
         )
         _warned.add(f"cut {instruction}")
-    _warned.update(f"word {word}" for word in unknown)
-    _warned.add(f"read {prompt}")
+    _warned.update([f"read {prompt}", *(f"word {word}" for word in unknown)])
 
 
 @dataclass
@@ -411,13 +408,14 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
     """LeRobot's tokenizer step with warnings about unknown words and cut prompts."""
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
-        found: dict[str, Tensor] = super()._tokenize_text(text)
+        encoded: dict[str, Tensor] = super()._tokenize_text(text)
         # Checked on token numbers first, because this runs at every control step. A full row may have been cut.
-        tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
-        unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
+        tokenizer, full = self.input_tokenizer, encoded["attention_mask"].bool().all(dim=-1)
+        number = -1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id
+        unknown = (encoded["input_ids"] == number).any(dim=-1)
         for row in (unknown | full).nonzero().flatten().tolist():
             warn_of_losses(tokenizer, text if isinstance(text, str) else text[row], self.max_length, bool(full[row]))
-        return found
+        return encoded
 
     def save_artifacts(self, save_directory: Path) -> dict[str, str]:
         """Save no tokenizer files: the settings hold the tokenizer's name or words."""

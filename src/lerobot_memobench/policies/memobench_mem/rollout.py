@@ -26,12 +26,10 @@ class EnvMemory:
     Attributes:
         clock: phase and control step since the phase began. position: control step since the episode began.
         memory: state of the memory mechanism; None before the first frame. intact: its state before a corruption.
-        emptied: whether the next frame is the memory's first, after a corruption.
-        stored: the last frame that was written.
-        missed: step of the first frame that should have been written and was not observed; None: none.
+        emptied: whether the next frame is the memory's first, after a corruption. stored: the last written frame.
+        missed: step of the first frame that should have been written and was not observed.
         queue: remaining planned actions. last: the last action (A,).
-        pose: of the hand when the last chunk was planned, and skipped: actions of that chunk that were left out
-            (`begin_chunk`).
+        pose: of the hand when the last chunk was planned. skipped: actions of that chunk that were left out.
         reads: memory reads of the episode's chunks, if they are watched.
     """
 
@@ -87,14 +85,10 @@ class EnvMemory:
 
 
 class Rollout:
-    """The environments of a vector environment.
+    """The environments of a vector environment, of which every ``stride``-th frame is written, if any (``remembers``).
 
-    The clock of an environment shows that an episode begins or has ended (`begins_episode`, `is_frozen`). If
-    observations have no clock, each observation is a control step.
-
-    Args:
-        remembers: whether frames are written.
-        stride: control steps between written frames; an episode's first frame is always written.
+    The clock of an environment shows that an episode begins or has ended (`begins_episode`, `is_frozen`). An episode's
+    first frame is always written. If observations have no clock, each observation is a control step.
     """
 
     def __init__(self, remembers: bool, stride: int) -> None:

@@ -19,7 +19,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import TEXT, TEXT_MASK
 from lerobot_memobench.tasks.memory_text import MARK
 
 logger = logging.getLogger(__name__)
@@ -38,11 +37,11 @@ def texts_of(subgoals: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
 
 def subgoals_of(texts: Sequence[str], episodes: np.ndarray, tasks: Iterable[Iterable[str]]) -> dict[str, list[str]]:
     """Return instruction -> sorted texts of its checkpoints, given the instructions of each episode."""
-    found = dict[str, set[str]]()
+    by_task = dict[str, set[str]]()
     for instructions, own in zip(tasks, _of_episodes(texts, episodes), strict=True):
         for task in instructions:
-            found.setdefault(str(task), set()).update(filter(None, own))
-    return {task: sorted(own) for task, own in sorted(found.items())}
+            by_task.setdefault(str(task), set()).update(filter(None, own))
+    return {task: sorted(own) for task, own in sorted(by_task.items())}
 
 
 def _of_episodes(texts: Sequence[str], episodes: np.ndarray) -> list[Sequence[str]]:
@@ -229,11 +228,3 @@ def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncod
     """Build a text encoder: ``words``, ``labels``, or the folder or repository of a SigLIP model."""
     built_in = {"words": WordTextEncoder, "labels": LabelTextEncoder}
     return built_in[name](dim) if name in built_in else SiglipTextEncoder(name, dim, device)
-
-
-def embedded_texts(embeddings: Tensor, rows: Tensor) -> dict[str, Tensor]:
-    """Return the texts (..., d_t) of frames and their mask (...), as inputs of `losses.alignment_loss`.
-
-    ``embeddings`` (T, d_t) are those of all texts; ``rows`` (...) is the row of each frame's text, -1 for none.
-    """
-    return {TEXT_MASK: rows >= 0, TEXT: embeddings[rows.long().clamp(min=0)]}

@@ -123,8 +123,8 @@ class Lookup(nn.Module):
         query = torch.einsum("rnhe,hed->rhnd", self.query(asking).unflatten(2, (HEADS, -1)), of_key).flatten(1, 2)
         scores = torch.bmm(query, keys.transpose(1, 2)) * of_key.shape[1] ** -0.5
         weights = scores.masked_fill(hidden[:, None], -torch.inf).softmax(dim=2)
-        found = torch.bmm(weights, values).unflatten(1, (HEADS, -1))
-        asking = self.norms[0](asking + torch.einsum("rhnd,hed->rnhe", found, of_value).flatten(2))
+        read = torch.bmm(weights, values).unflatten(1, (HEADS, -1))
+        asking = self.norms[0](asking + torch.einsum("rhnd,hed->rnhe", read, of_value).flatten(2))
         return self.norms[1](asking + self.mlp(asking)), weights
 
 
@@ -154,12 +154,12 @@ class BankStream(nn.Module):
         values = torch.cat([entries, present[:, None]], dim=1)
         keys = values + self.time(waves(torch.cat([steps, now[:, None]], dim=1)))[:, :, None]
         keys, values = keys.flatten(1, 2), values.flatten(1, 2)
-        found, looked = present, []
+        retrieved, looked = present, []
         for block in self.blocks:
-            found, weights = block(found, keys, values, hidden)
+            retrieved, weights = block(retrieved, keys, values, hidden)
             looked.append(weights)
-        gate = self.gate(torch.cat([present, found], dim=2)).sigmoid()
-        return gate * present + (1 - gate) * found, looked
+        gate = self.gate(torch.cat([present, retrieved], dim=2)).sigmoid()
+        return gate * present + (1 - gate) * retrieved, looked
 
 
 def shares_of(looked: list[Tensor], tokens: int) -> Tensor:

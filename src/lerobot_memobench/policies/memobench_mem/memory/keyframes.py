@@ -197,5 +197,5 @@ class Keyframes(MemoryMechanism):
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the losses of the last replay with labels, for the checkpoint and for the keyframes."""
-        found, self._losses = self._losses, {}
-        return found
+        losses, self._losses = self._losses, {}
+        return losses

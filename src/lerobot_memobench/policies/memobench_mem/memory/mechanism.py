@@ -294,17 +294,17 @@ class MemoryMechanism(nn.Module, ABC):
         state, row_of, ends = _rows(state, order), order.argsort()[row_of], counts[order].tolist()
         needed, where = places[order].clamp(min=0).unique(return_inverse=True)
         pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
-        query, found, samples = None if query is None else query.rows(order), [], []
+        query, states, samples = None if query is None else query.rows(order), [], []
         for time in range(ends[0] + 1):
             samples.append((stops == time).nonzero().flatten())
             if len(samples[-1]):
-                found.append(_rows(state, row_of[samples[-1]]))
+                states.append(_rows(state, row_of[samples[-1]]))
             going = sum(end > time for end in ends)
             state = _rows(state, slice(going))
             if going:
                 now, part = where[:going, time], None if query is None else query.rows(slice(going))
                 state = self.write(state, pooled[now], steps[now], part)
-        return _rows(self.join(found), torch.cat(samples).argsort())
+        return _rows(self.join(states), torch.cat(samples).argsort())
 
     # -- losses -------------------------------------------------------------------------------------
 

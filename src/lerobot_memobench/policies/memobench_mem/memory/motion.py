@@ -98,10 +98,10 @@ class Foresight(MemoryFusion):
 
     parts = ("foresight.",)
 
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
-        self.model = cast(Any, model)
-        pool = self.model.memory.pool
-        self.model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
+        super().__init__(model, memory_dim, expert_dim)
+        pool = model.memory.pool
+        model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass conditioned on this memory."""
@@ -318,8 +318,8 @@ class PictureMotion(MotionField):
 
     def tokens(self, fields: Tensor) -> Tensor:
         """Return a token per two fields (or four) and 2 x 2 blocks (or 4 x 4)."""
-        found = self.convolve(rearrange(fields, "b h (y x) k -> b k h y x", y=BLOCKS))
-        return (rearrange(found, "b w t y x -> b t (y x) w") + self.times + self.places).flatten(1, 2)
+        features = self.convolve(rearrange(fields, "b h (y x) k -> b k h y x", y=BLOCKS))
+        return (rearrange(features, "b w t y x -> b t (y x) w") + self.times + self.places).flatten(1, 2)
 
 
 # -- objects ----------------------------------------------------------------------------------------------------------
@@ -388,13 +388,13 @@ class ObjectMotion(MotionField):
         pairs, went = self._between(frames[:, :-1].flatten(0, 1), frames[:, 1:].flatten(0, 1))
         pairs, went = (of.unflatten(0, (-1, count)) for of in (pairs, went))
         cell = torch.arange(self.cells, device=went.device).expand(len(frames), -1)
-        known, found = torch.ones_like(cell, dtype=torch.bool), []
+        known, followed = torch.ones_like(cell, dtype=torch.bool), []
         for number in range(count):
             now = pairs[:, number].gather(1, cell.unsqueeze(-1).expand(-1, -1, self.numbers))
             known = known & (now[..., MOVED] > 0)
-            found.append((now[..., :MOVED], known))
+            followed.append((now[..., :MOVED], known))
             cell = went[:, number].gather(1, cell)
-        moved, knowns = (torch.stack(parts, dim=1) for parts in zip(*found, strict=True))
+        moved, knowns = (torch.stack(parts, dim=1) for parts in zip(*followed, strict=True))
         return moved, knowns
 
     def tokens(self, fields: Tensor) -> Tensor:

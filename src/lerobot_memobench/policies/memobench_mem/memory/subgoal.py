@@ -7,7 +7,7 @@ text follow the prefix, attend to all of it, and are all that the action expert 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,11 +15,8 @@ from einops import repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
-
-if TYPE_CHECKING:
-    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 SCORES = "memory.scores"
 
@@ -89,20 +86,16 @@ class NarrowPass(MemoryPass):
     the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
     the instruction.
 
-    In training the text is the true one; otherwise a pass over the prefix, which does not depend on later tokens,
-    chooses it.
-
-    Attributes:
-        chosen: (B,) index of the text in the prefix; S: the empty text.
+    In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen`` (B,), S: none).
     """
 
     watches = ("prefix",)
 
-    def __init__(self, model: MemoryPI05, memory: MemoryTokens, watched: bool) -> None:
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool) -> None:
         super().__init__(watched)
         assert memory.query is not None
         self.model, self.memory, self.query = model, memory, memory.query
-        self.choice = cast(SubgoalChoice, model.subgoal)
+        self.choice: SubgoalChoice = model.subgoal
         self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
@@ -147,12 +140,12 @@ class NarrowPass(MemoryPass):
         assert self.chosen is not None
         _, real = self.choice.texts(self.chosen)
         words, length = real.shape[1], self.memory.mask.shape[1]
-        of_prefix, found = self.attention["prefix"], []
+        of_prefix, shares = self.attention["prefix"], []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
             unread = weights.shape[2] - words - (self.model.state_token is not None)
             read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
-            found.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
-        return found
+            shares.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
+        return shares
 
 
 class NarrowChannel(MemoryFusion):
@@ -161,9 +154,8 @@ class NarrowChannel(MemoryFusion):
     reports_reads = True
     parts = ("subgoal.",)
 
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
-        assert model.memory is not None
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
+        super().__init__(model, memory_dim, expert_dim)
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
@@ -171,7 +163,7 @@ class NarrowChannel(MemoryFusion):
         return NarrowPass(self.model, memory, watched)
 
 
-class Subgoal(Frames):
+class Subgoal(FrameSampling):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
     As in the source: cross-entropy of the text with weight 1 next to the actions' loss; the expert is trained on states
