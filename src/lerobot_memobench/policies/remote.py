@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from operator import call
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -233,11 +232,9 @@ class RemotePolicy(UntrainedPolicy):
         while len(self._clients) < count:
             self._add_client()
         batch = _flat(batch)
-        jobs = [
-            partial(client.act, Observation(batch, index, self._cameras))
-            for index, client in enumerate(self._clients[:count])
-        ]
-        return torch.from_numpy(np.stack([job() for job in jobs] if count == 1 else [*self._pool.map(call, jobs)]))
+        observations = [Observation(batch, index, self._cameras) for index in range(count)]
+        each = map if count == 1 else self._pool.map
+        return torch.from_numpy(np.stack([*each(Client.act, self._clients, observations)]))
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -252,8 +249,8 @@ class Client:
     """
 
     def __init__(self, config: RemoteConfig, address: str) -> None:
-        self._config, self._keys = config, config.sent()
-        self._connection = config.connection(address, config.timeout)
+        self._config = config
+        self._connection = config.connection(address, config.timeout, config.sent())
         self._stated: str | None = None  # the convention that the server states; None: not connected
         self._used = False  # whether the connection has served an episode
         self.forget()
@@ -284,17 +281,17 @@ class Client:
         if phase not in (None, EXECUTION):  # actions have no effect
             self._prompt = True
             if self._shows_prompt(self._clock[1]):
-                self._connection.show(self._frame(observation), self._keys)
+                self._connection.show(self._frame(observation))
             return np.zeros(ACTION_DIM, np.float32)
         if self._prompt:
             self._connection.end_prompt()
             self._prompt = False
         if not self._queue:
-            answer = self._connection.plan(self._frame(observation), self._keys)
+            answer = self._connection.plan(self._frame(observation))
             actions = read_actions(answer, self._config, self._connection.address)
             self._queue.extend(actions[: self._config.n_action_steps])
         elif self._config.connection.buffers:
-            self._connection.watch(self._frame(observation), self._keys)
+            self._connection.watch(self._frame(observation))
         return self._queue.popleft()
 
     def _now(self, step: int | None, phase: int | None) -> tuple[int, int]:
@@ -331,7 +328,7 @@ class Client:
     def _frame(self, observation: Observation) -> Frame:
         """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
-        found = {name: observation.get(name) for name in (*buffered, *self._keys.values())}
+        found = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
         if observation.scalar(STEP) is not None:
             found[STEP] = observation.get(STEP)
         return {name: fit(value, self._config.side) if np.ndim(value) == 3 else value for name, value in found.items()}

@@ -62,13 +62,13 @@ class Connection:
         queues: the server answers one action and queues the rest of its plan.
 
     Args:
-        address: ``ws://host:port``. timeout: longest time of an answer, s.
+        address: ``ws://host:port``. timeout: longest time of an answer, s. keys: in place of the dialect's.
     """
 
     # openpi: examples/libero/main.py, src/openpi/serving/websocket_policy_server.py, openpi-client 0.1.2
     protocol: ClassVar[str] = "openpi's websocket protocol"
     port: ClassVar[int] = 8000
-    keys: ClassVar[Mapping[str, str]] = {
+    keys: Mapping[str, str] = {
         "observation/image": IMAGE,
         "observation/wrist_image": WRIST_IMAGE,
         "observation/state": STATE,
@@ -80,8 +80,8 @@ class Connection:
     buffers: ClassVar[bool] = False
     queues: ClassVar[bool] = False
 
-    def __init__(self, address: str, timeout: float) -> None:
-        self.address, self.timeout = address, timeout
+    def __init__(self, address: str, timeout: float, keys: Mapping[str, str] | None = None) -> None:
+        self.address, self.timeout, self.keys = address, timeout, keys or self.keys
         self._stack = ExitStack()
         self._connection: ClientConnection | None = None
 
@@ -90,19 +90,19 @@ class Connection:
     def begin(self, task: str) -> None:
         """Begin an episode, on a new connection."""
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: Frame) -> None:
         """Send a frame of the prompt."""
-        self.plan(frame, keys)
+        self.plan(frame)
 
     def end_prompt(self) -> None:
         """Note that all frames so far belong to the prompt."""
 
-    def watch(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def watch(self, frame: Frame) -> None:
         """Keep a frame of the execution whose action is planned already."""
 
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
-        """Return the server's answer to an observation; ``keys``: the server's name -> our name of what is sent."""
-        return self.ask({theirs: frame[ours] for theirs, ours in keys.items()})
+    def plan(self, frame: Frame) -> dict[str, Any]:
+        """Return the server's answer to an observation."""
+        return self.ask({theirs: frame[ours] for theirs, ours in self.keys.items()})
 
     # --- messages ---
 
@@ -235,7 +235,7 @@ class RoboMMEConnection(Connection):
         self._sent = self._execution_starts = 0
         self.ask({"reset": True})
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: Frame) -> None:
         """Keep a frame for the next question."""
         self._frames.append(frame)
 
@@ -245,7 +245,7 @@ class RoboMMEConnection(Connection):
         """Note that all frames so far belong to the prompt."""
         self._execution_starts = self._sent + len(self._frames)
 
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
+    def plan(self, frame: Frame) -> dict[str, Any]:
         """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
         self._sent += len(frames)
@@ -257,7 +257,7 @@ class RoboMMEConnection(Connection):
                 "exec_start_idx": self._execution_starts,
             }
         )
-        return super().plan(frame, keys)
+        return super().plan(frame)
 
 
 # --- openpi's format ---
@@ -336,23 +336,21 @@ class VlaEvalConnection(Connection):
     keys = {"images.agentview": IMAGE, "images.wrist": WRIST_IMAGE, "states": STATE, "task_description": TASK}
     image_size, n_action_steps, prompt_stride, queues = None, 1, 1, True
 
-    def __init__(self, address: str, timeout: float) -> None:
-        super().__init__(address, timeout)
-        self._number, self._in_episode, self._warned = 0, False, False
+    _number, _in_episode, _warned = 0, False, False
 
     def begin(self, task: str) -> None:
         """Begin an episode; of its task the server learns the instruction alone."""
         self._frames: list[Frame] = []
         self.ask({"type": "episode_start", "payload": {"task": {"name": task}}})
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: Frame) -> None:
         """Keep a frame for the next question."""
-        self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in keys.values()})
+        self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in self.keys.values()})
 
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
+    def plan(self, frame: Frame) -> dict[str, Any]:
         """Return the server's answer, with ``actions``; the first question of an episode has its prompt."""
         payload: dict[str, Any] = {}
-        for theirs, ours in [*keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
+        for theirs, ours in [*self.keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
             outer, point, inner = theirs.partition(".")
             if point:
                 payload.setdefault(outer, {})[inner] = _as_png(frame[ours])
