@@ -50,8 +50,8 @@ def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
         levels = zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
         return task.language in subgoals and any(known.issuperset(texts) for texts in levels)
 
-    found = filter(fits, map(get_task, task_names(suite=None)))
-    best = max(found, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
+    fitting = filter(fits, map(get_task, task_names(suite=None)))
+    best = max(fitting, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
     return TASK if best is None else best.name
 
 
@@ -90,12 +90,12 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
 
 def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a coloured square that moves along places (T, 2) in [-1, 1]."""
-    found = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+    pictures = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
     corners = ((places + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
-    for picture, (top, left) in zip(found, corners, strict=True):
+    for picture, (top, left) in zip(pictures, corners, strict=True):
         picture[top : top + side, left : left + side] = colour
-    return found
+    return pictures
 
 
 @dataclass(frozen=True)
@@ -153,17 +153,17 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
     table = read_frame_table(Path(dataset.root))
-    found: list[tuple[bool, tuple[int, ...], str]] = []
+    episodes: list[tuple[bool, tuple[int, ...], str]] = []
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         acting = (first + np.flatnonzero(table.acts[first:end])[:frames]).tolist()
         if acting:
             indices = range(first, acting[-1] + 1) if prompts else acting
             prompted = float(dataset.hf_dataset[first][OBS_PHASE]) != EXECUTION
-            found.append((not prompted, tuple(indices), episode["tasks"][0]))
+            episodes.append((not prompted, tuple(indices), episode["tasks"][0]))
     if prompts:
-        found.sort(key=lambda one: (one[0], len(one[1])))
-    for _, indices, task in found:
+        episodes.sort(key=lambda one: (one[0], len(one[1])))
+    for _, indices, task in episodes:
         shown: list[dict[str, Tensor]] = []
         for index in indices:
             item = dataset[index] if pictures else dataset.hf_dataset[index]

@@ -132,15 +132,15 @@ def _check_cameras(path: str, cameras: list[str], original: Mapping[str, str]) -
     if not missing:
         return
     free = [known for name, known in original.items() if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
-    found = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
+    inputs = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
     if len(free) < len(missing):
         raise MemobenchError(
-            f"{found}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
+            f"{inputs}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
             "this environment"
         )
     mapped = {name: known for known, name in original.items() if known in cameras and known != name}
     guess = json.dumps(mapped | dict(zip(free, missing, strict=False)))
-    raise MemobenchError(f"{found}; map its names, for example by --rename_map='{guess}'")
+    raise MemobenchError(f"{inputs}; map its names, for example by --rename_map='{guess}'")
 
 
 def _list(original: Mapping[str, str]) -> str:
@@ -219,32 +219,32 @@ def chosen_convention(
     """
     if asked is not None:
         check_choice("convention", asked, [*WRIST])
-    found: str | None = UPRIGHT
+    own: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
     elif path is None or not policy.image_features:
         return asked
     else:
-        found, why = trained_convention(path, policy)
+        own, why = trained_convention(path, policy)
     name = path or policy.type
     command = f"lerobot eval env=memobench policy={name} convention="
-    if found is None and asked is None:
+    if own is None and asked is None:
         raise MemobenchError(
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
     mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
     for other in (asked, *mapped):
-        if found is not None and other not in (None, found):
+        if own is not None and other not in (None, own):
             where = "" if other == asked else " in rename_map, which does not mirror pictures"
             raise MemobenchError(
-                f"the policy {name} expects pictures of convention={found} ({why}), and found {other}{where}; run "
-                f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
-                f"--env.convention={found}`"
+                f"the policy {name} expects pictures of convention={own} ({why}), and found {other}{where}; run "
+                f"`{command}{own}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
+                f"--env.convention={own}`"
             )
-    if asked is None and found != UPRIGHT:
-        logger.warning("pictures have convention=%s, as in the training of %s (%s)", found, name, why)
-    return asked or found
+    if asked is None and own != UPRIGHT:
+        logger.warning("pictures have convention=%s, as in the training of %s (%s)", own, name, why)
+    return asked or own
 
 
 # --- the clock of observations ---

@@ -148,7 +148,7 @@ def find_reads(
     rollouts with pauses have no chunks.
     """
     unseen = protocol.get("prompt_in") == RESET
-    found: dict[int, list[Chunk]] = {}
+    chunks_of: dict[int, list[Chunk]] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
         try:
@@ -172,10 +172,10 @@ def find_reads(
         if not _fit(reads, chunks, record):
             misfits.append(f"{path} is not of the rollout in the log")
         elif not record.get("paused_steps"):
-            found[k] = chunks
+            chunks_of[k] = chunks
     if not misfits:
-        return found, []
-    return found, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
+        return chunks_of, []
+    return chunks_of, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
 
 
 def _fit(reads: EpisodeReads, chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:

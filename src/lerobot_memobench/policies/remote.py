@@ -258,9 +258,9 @@ class Client:
     def connect(self) -> None:
         """Connect within ``connect_timeout``, so that a missing server is an error before any simulation."""
         if self._stated is None:
-            found = self._connection.open(self._config.connect_timeout)
-            logger.info("connected with the policy server at %s: %s", self._connection.address, short(found))
-            self._stated = str(found.get(STATED))
+            metadata = self._connection.open(self._config.connect_timeout)
+            logger.info("connected with the policy server at %s: %s", self._connection.address, short(metadata))
+            self._stated = str(metadata.get(STATED))
 
     def forget(self) -> None:
         """Begin a rollout: the next observation is of another episode."""
@@ -328,10 +328,10 @@ class Client:
     def _frame(self, observation: Observation) -> Frame:
         """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
-        found = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
+        values = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
         if observation.scalar(STEP) is not None:
-            found[STEP] = observation.get(STEP)
-        return {name: fit(value, self._config.side) if np.ndim(value) == 3 else value for name, value in found.items()}
+            values[STEP] = observation.get(STEP)
+        return {name: fit(value, self._config.side) if np.ndim(value) == 3 else value for name, value in values.items()}
 
 
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
@@ -340,10 +340,11 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
     Infinite actions are returned too: the environment ends that episode, and the others continue.
     """
 
-    def wrong(found: str) -> MemobenchError:
+    def wrong(problem: str) -> MemobenchError:
         return MemobenchError(
-            f"the policy server at {address} answered {found}; expected finite numbers of shape (steps, {ACTION_DIM}), "
-            f"at most {MOST_ACTIONS:,} steps: six numbers of the end effector's displacement and one of the gripper"
+            f"the policy server at {address} answered {problem}; expected finite numbers of shape (steps, "
+            f"{ACTION_DIM}), at most {MOST_ACTIONS:,} steps: six numbers of the end effector's displacement and one of "
+            "the gripper"
         )
 
     if "actions" not in answer:
@@ -389,8 +390,8 @@ class Observation:
     @property
     def blank(self) -> bool:
         """Whether this environment is not simulated: its episode is already in the log, and its observation is zero."""
-        found = [value[self.env_index] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
-        return bool(found) and not any(bool(value.any()) for value in found)
+        values = [value[self.env_index] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
+        return bool(values) and not any(bool(value.any()) for value in values)
 
     def get(self, name: str) -> Any:
         """Return an observation by our name: an image (H, W, 3) uint8, a vector float32, or the instruction."""

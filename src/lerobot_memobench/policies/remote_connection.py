@@ -285,14 +285,14 @@ def unpack(data: bytes) -> Any:
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)
 
 
-def _unpack(found: dict[Any, Any]) -> Any:
-    if "__ndarray__" in found:
-        return _array(found["data"], found["dtype"], found["shape"])
-    if b"__ndarray__" in found:
-        return _array(found[b"data"], found[b"dtype"], found[b"shape"])
-    if b"__npgeneric__" in found:
-        return _dtype(found[b"dtype"]).type(found[b"data"])  # of the data's length, whatever length dtype names
-    return found
+def _unpack(packed: dict[Any, Any]) -> Any:
+    if "__ndarray__" in packed:
+        return _array(packed["data"], packed["dtype"], packed["shape"])
+    if b"__ndarray__" in packed:
+        return _array(packed[b"data"], packed[b"dtype"], packed[b"shape"])
+    if b"__npgeneric__" in packed:
+        return _dtype(packed[b"dtype"]).type(packed[b"data"])  # of the data's length, whatever length dtype names
+    return packed
 
 
 def _array(data: bytes, dtype: Any, shape: Any) -> np.ndarray:
@@ -365,30 +365,30 @@ class VlaEvalConnection(Connection):
     def _greet(self, patience: float) -> dict[str, Any]:
         """Send hello; return the server's name and version from its answer, and the convention that it states."""
         self._say("hello", {"harness_version": VERSION, "protocol_version": PROTOCOL, "benchmark": "MEMOBench"})
-        kind, found = self._hear(patience)
+        kind, payload = self._hear(patience)
         if kind != "hello":
             raise self._foreign(f"it answered a hello with {short(kind)}")
-        if (version := short(found.get("protocol_version"))) != str(PROTOCOL):
+        if (version := short(payload.get("protocol_version"))) != str(PROTOCOL):
             raise MemobenchError(
                 f"the policy server at {self.address} has version {version} of {self.protocol}; expected version "
                 f"{PROTOCOL}: serve the policy with vla-eval {VERSION}"
             )
-        if not self._warned and (others := _other_formats(found)):
+        if not self._warned and (others := _other_formats(payload)):
             logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
         self._warned = True
-        asked = found.get("observation_params")
+        asked = payload.get("observation_params")
         stated = {STATED: asked[STATED]} if isinstance(asked, dict) and STATED in asked else {}
-        return stated | {name: found[name] for name in ("model_server", "harness_version") if name in found}
+        return stated | {name: payload[name] for name in ("model_server", "harness_version") if name in payload}
 
     def _exchange(self, question: dict[str, Any]) -> dict[str, Any]:
         self._say(question["type"], question["payload"])
         if question["type"] == "episode_start":
             self._in_episode = True
             return {}
-        kind, found = self._hear(self.timeout)
+        kind, payload = self._hear(self.timeout)
         if kind != "action":
             raise self._foreign(f"it answered an observation with {short(kind)}")
-        return {"actions": found["action"], **found} if "action" in found else found
+        return {"actions": payload["action"], **payload} if "action" in payload else payload
 
     def _say(self, kind: str, payload: dict[str, Any]) -> None:
         self._number += 1
@@ -397,8 +397,8 @@ class VlaEvalConnection(Connection):
 
     def _hear(self, patience: float) -> tuple[str, dict[str, Any]]:
         """Return type and payload of the next frame."""
-        found = self._receive(patience)
-        kind, payload = (found.get("type"), found.get("payload")) if isinstance(found, dict) else (None, None)
+        frame = self._receive(patience)
+        kind, payload = (frame.get("type"), frame.get("payload")) if isinstance(frame, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(payload, dict):
             raise self._foreign("its frames have no type and payload")
         if kind == "error":
