@@ -39,11 +39,7 @@ def write_streams(
 
 
 def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
-    """Return a task with checkpoints that a memory knows, preferably with a prompt and many checkpoints.
-
-    Args:
-        subgoals: instruction -> texts that the memory was trained with. If no task fits, `TASK` is returned.
-    """
+    """Return a task for a memory's texts of each instruction, preferably with a prompt and many checkpoints."""
     known = {text for own in subgoals.values() for text in own}
 
     def fits(task: Task) -> bool:
@@ -146,8 +142,7 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     Args:
         dataset: without delta timestamps.
         pictures: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first. If not,
-            streams have the order of the dataset.
+        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
         frames: number of execution frames that are not held.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE

@@ -81,7 +81,6 @@ def check_features(
     that read pictures of any size, would act on inputs unlike their training data.
 
     Args:
-        path: folder of the checkpoint, or a repository. policy: its configuration.
         shown: features of the environment's observations and action, by LeRobot's names.
         renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
     """
@@ -207,15 +206,11 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
 def chosen_convention(
     path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
 ) -> str | None:
-    """Return the convention of the pictures for a policy: the one that was asked for, else that of its training.
+    """Return the convention of the pictures for a policy: ``asked``, else that of its training.
 
-    None if none was and the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused;
-    so is none where the policy's is unclear.
-
-    Args:
-        path: folder or repository of its checkpoint, or None. policy: its configuration.
-        asked: the convention that was named, None if none was.
-        rename_map: of the evaluation. It may name the wrist camera of a convention, but it does not mirror pictures.
+    None if the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused; so is none
+    where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
+    mirror pictures.
     """
     if asked is not None:
         check_choice("convention", asked, [*WRIST])

@@ -99,14 +99,7 @@ def check_device(device: str | None) -> None:
 
 
 def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the episode log.
-
-    Args:
-        policy: its configuration.
-        path: its checkpoint; None for a policy without one.
-        seeds: seeds of the requested episodes, see `Acting`.
-        settings: settings of its environments.
-    """
+    """Return the description of a policy for the episode log; ``seeds``: of the requested episodes, see `Acting`."""
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
     return Acting(_identity(policy, path), inputs, run, seeds)
