@@ -278,14 +278,11 @@ class Client:
             return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or is not simulated
         if begins:
             self._begin(observation)
-        if phase not in (None, EXECUTION):  # actions have no effect
-            self._prompt = True
+        self._prompt = phase not in (None, EXECUTION)
+        if self._prompt:  # actions have no effect
             if self._shows_prompt(self._clock[1]):
                 self._connection.show(self._frame(observation))
             return np.zeros(ACTION_DIM, np.float32)
-        if self._prompt:
-            self._connection.end_prompt()
-            self._prompt = False
         if not self._queue:
             answer = self._connection.plan(self._frame(observation))
             actions = read_actions(answer, self._config, self._connection.address)
@@ -310,7 +307,7 @@ class Client:
             )
         if self._used:
             self._connection.open(self._config.connect_timeout)
-        self._used, self._prompt = True, False
+        self._used = True
         self._queue.clear()
         self._connection.begin(observation.get(TASK))
 

@@ -94,9 +94,6 @@ class Connection:
         """Send a frame of the prompt."""
         self.plan(frame)
 
-    def end_prompt(self) -> None:
-        """Note that all frames so far belong to the prompt."""
-
     def watch(self, frame: Frame) -> None:
         """Keep a frame of the execution whose action is planned already."""
 
@@ -232,23 +229,21 @@ class RoboMMEConnection(Connection):
     def begin(self, task: str) -> None:
         """Clear the server's memory."""
         self._frames: list[Frame] = []
-        self._sent = self._execution_starts = 0
+        self._execution_starts = 0
         self.ask({"reset": True})
 
     def show(self, frame: Frame) -> None:
         """Keep a frame for the next question."""
         self._frames.append(frame)
+        self._execution_starts += 1
 
-    watch = show
-
-    def end_prompt(self) -> None:
-        """Note that all frames so far belong to the prompt."""
-        self._execution_starts = self._sent + len(self._frames)
+    def watch(self, frame: Frame) -> None:
+        """Keep a frame for the next question."""
+        self._frames.append(frame)
 
     def plan(self, frame: Frame) -> dict[str, Any]:
         """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
-        self._sent += len(frames)
         self.ask(
             {
                 "images": np.stack([frame[IMAGE] for frame in frames])[:, None],
