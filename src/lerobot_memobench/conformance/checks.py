@@ -44,7 +44,7 @@ class CheckOutcome(StrEnum):
 
 PASSED, FAILED, NO_MEMORY, NOT_CHECKED = CheckOutcome
 
-Finding = tuple[CheckOutcome, str]
+CheckVerdict = tuple[CheckOutcome, str]
 """An outcome and its sentence: the problem and its solution."""
 
 
@@ -143,7 +143,7 @@ class Behaviour:
 
 # --- the checks, in an order in which later ones rely on earlier ones ---
 
-Check = Callable[[Behaviour], Finding]
+Check = Callable[[Behaviour], CheckVerdict]
 CHECKS: dict[str, Check] = {}
 
 
@@ -151,7 +151,7 @@ def check(name: str, *, of_memory: bool = False) -> Callable[[Check], Check]:
     """Add a function to the checks; one ``of_memory`` is skipped for a policy without."""
 
     def add(function: Check) -> Check:
-        def checked(behaviour: Behaviour) -> Finding:
+        def checked(behaviour: Behaviour) -> CheckVerdict:
             return (NO_MEMORY, "it has no memory") if of_memory and not behaviour.memory else function(behaviour)
 
         CHECKS[name] = checked
@@ -175,7 +175,7 @@ def run_checks(subject: Subject) -> list[Result]:
 
 
 @check("deterministic given a seed")
-def _is_deterministic(behaviour: Behaviour) -> Finding:
+def _is_deterministic(behaviour: Behaviour) -> CheckVerdict:
     from lerobot.utils.random_utils import set_seed
 
     rolled = []
@@ -192,7 +192,7 @@ def _is_deterministic(behaviour: Behaviour) -> Finding:
 
 
 @check("reset forgets")
-def _reset_forgets(behaviour: Behaviour) -> Finding:
+def _reset_forgets(behaviour: Behaviour) -> CheckVerdict:
     before = []
     for stream in (behaviour.two.until(behaviour.two.start + 4), behaviour.three):
         behaviour.subject.roll([stream])
@@ -208,7 +208,7 @@ def _reset_forgets(behaviour: Behaviour) -> Finding:
 
 
 @check("remembers")
-def _remembers(behaviour: Behaviour) -> Finding:
+def _remembers(behaviour: Behaviour) -> CheckVerdict:
     if behaviour.memory:
         return PASSED, f"frames of the past change actions by up to {behaviour.memory:.2g}"
     return FAILED, (
@@ -217,7 +217,7 @@ def _remembers(behaviour: Behaviour) -> Finding:
 
 
 @check("reads the prompt", of_memory=True)
-def _reads_the_prompt(behaviour: Behaviour) -> Finding:
+def _reads_the_prompt(behaviour: Behaviour) -> CheckVerdict:
     if not behaviour.subject.reads_prompt:
         return FAILED, (
             "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
@@ -234,7 +234,7 @@ def _reads_the_prompt(behaviour: Behaviour) -> Finding:
 
 
 @check("plans after the prompt")
-def _plans_after_prompt(behaviour: Behaviour) -> Finding:
+def _plans_after_prompt(behaviour: Behaviour) -> CheckVerdict:
     if behaviour.one.start in behaviour.plans:
         return PASSED, "the first execution frame decides the first action"
     return FAILED, (
@@ -244,19 +244,19 @@ def _plans_after_prompt(behaviour: Behaviour) -> Finding:
 
 
 @check("remembers every control step", of_memory=True)
-def _remembers_every_step(behaviour: Behaviour) -> Finding:
-    subject, finding = behaviour.subject, _remembers_between_plans(behaviour)
+def _remembers_every_step(behaviour: Behaviour) -> CheckVerdict:
+    subject, verdict = behaviour.subject, _remembers_between_plans(behaviour)
     # Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
-    for steps in INTERVALS if finding[0] is FAILED and hasattr(subject.policy.config, "n_action_steps") else ():
+    for steps in INTERVALS if verdict[0] is FAILED and hasattr(subject.policy.config, "n_action_steps") else ():
         # A policy may refuse an interval, such as one longer than its chunks.
         with subject.planning_every(steps), contextlib.suppress(Exception):
             other = _remembers_between_plans(Behaviour(subject))
             if other[0] is PASSED:
                 return other
-    return finding
+    return verdict
 
 
-def _remembers_between_plans(behaviour: Behaviour) -> Finding:
+def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
     between = [frame for frame in behaviour.by_frame if frame not in behaviour.plans]
     if not between:
         return PASSED, "it plans at every control step"
@@ -274,7 +274,7 @@ def _remembers_between_plans(behaviour: Behaviour) -> Finding:
 
 
 @check("rows are independent")
-def _rows_are_independent(behaviour: Behaviour) -> Finding:
+def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
     roll, one = behaviour.subject.roll, behaviour.one
     # The other rows begin at other steps.
     between = roll([behaviour.two, one, behaviour.three])[:, 1]
@@ -287,7 +287,7 @@ def _rows_are_independent(behaviour: Behaviour) -> Finding:
 
 
 @check("finished rows change no other")
-def _finished_rows_change_no_other(behaviour: Behaviour) -> Finding:
+def _finished_rows_change_no_other(behaviour: Behaviour) -> CheckVerdict:
     over = behaviour.two.until(behaviour.two.start + 4)
     call = behaviour.differ(behaviour.subject.roll([over, behaviour.one])[:, 1], behaviour.after_two)
     if call is None:
@@ -298,7 +298,7 @@ def _finished_rows_change_no_other(behaviour: Behaviour) -> Finding:
 
 
 @check("same history in training")
-def _same_history_in_training(behaviour: Behaviour) -> Finding:
+def _same_history_in_training(behaviour: Behaviour) -> CheckVerdict:
     plans = sorted({*behaviour.plans, *behaviour.all_plans[-COMPARED:]})  # a hold may have thousands
     if not plans:
         return NOT_CHECKED, "no frame changes the action of its own call, so the beginning of a chunk is unknown"
@@ -326,7 +326,7 @@ def _same_history_in_training(behaviour: Behaviour) -> Finding:
 
 
 @check("needs_observation is true")
-def _needs_observation_is_true(behaviour: Behaviour) -> Finding:
+def _needs_observation_is_true(behaviour: Behaviour) -> CheckVerdict:
     sparing = behaviour.subject.roll([behaviour.two, behaviour.one], sparing=True)[:, 1]
     call = behaviour.differ(sparing, behaviour.after_two)
     if call is None:

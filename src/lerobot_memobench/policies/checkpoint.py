@@ -62,7 +62,7 @@ class _StepConfig(TypedDict, total=False):
     rename_map: dict[str, str]
 
 
-class Step(TypedDict, total=False):
+class SavedStep(TypedDict, total=False):
     """A step of a processor; ``config`` of those that normalise or rename."""
 
     registry_name: str
@@ -71,7 +71,7 @@ class Step(TypedDict, total=False):
 
 
 class _Processor(TypedDict, total=False):
-    steps: list[Step]
+    steps: list[SavedStep]
 
 
 class _TrainedOn(TypedDict, total=False):
@@ -241,7 +241,7 @@ def check_statistics(source: str | Path, revision: str | None = None) -> None:
                 )
 
 
-def _normalised(step: Step, processor: str) -> Iterator[str]:
+def _normalised(step: SavedStep, processor: str) -> Iterator[str]:
     config = step.get("config", {})
     modes = config.get("norm_map", {})
     for key, feature in config.get("features", {}).items():
@@ -461,13 +461,13 @@ def trained_names(source: str | Path) -> dict[str, str]:
     return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
-def steps_of(file: Path | None) -> list[Step]:
+def steps_of(file: Path | None) -> list[SavedStep]:
     """Return the steps in the file of a processor; none without a file."""
-    steps: list[Step] = [] if file is None else read_json(file, _Processor).get("steps", [])
+    steps: list[SavedStep] = [] if file is None else read_json(file, _Processor).get("steps", [])
     return steps
 
 
-def _normalises(step: Step) -> bool:
+def _normalises(step: SavedStep) -> bool:
     return str(step.get("registry_name", "")).endswith("normalizer_processor")
 
 

@@ -34,7 +34,7 @@ from lerobot_memobench.policies.remote_connection import (
     TASK,
     WRIST_IMAGE,
     Connection,
-    Frame,
+    NamedValues,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED, WRIST
@@ -232,7 +232,7 @@ class RemotePolicy(UntrainedPolicy):
         while len(self._clients) < count:
             self._add_client()
         batch = _flat(batch)
-        observations = [Observation(batch, index, self._cameras) for index in range(count)]
+        observations = [EnvObservation(batch, index, self._cameras) for index in range(count)]
         each = map if count == 1 else self._pool.map
         return torch.from_numpy(np.stack([*each(Client.act, self._clients, observations)]))
 
@@ -268,7 +268,7 @@ class Client:
         self._prompt = self._rests = False
         self._queue: deque[Action] = deque()
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: EnvObservation) -> Action:
         """Return the action (7,) for the present observation, queued or of a new answer."""
         step, phase = observation.scalar(STEP), observation.scalar("phase")
         last, self._clock = self._clock, self._now(step, phase)
@@ -296,7 +296,7 @@ class Client:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
         return EXECUTION if phase is None else phase, step
 
-    def _begin(self, observation: Observation) -> None:
+    def _begin(self, observation: EnvObservation) -> None:
         """Start an episode on a connection of its own; the server's memory is cleared."""
         self.connect()
         shown = observation.convention
@@ -322,7 +322,7 @@ class Client:
     def _shows_prompt(self, step: int) -> bool:
         return self._config.send_prompt and step % self._config.prompt_stride == 0
 
-    def _frame(self, observation: Observation) -> Frame:
+    def _frame(self, observation: EnvObservation) -> NamedValues:
         """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
         values = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
@@ -364,7 +364,7 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
 
 
 @dataclass(frozen=True)
-class Observation:
+class EnvObservation:
     """One environment's observation in a batch; values are copied on access.
 
     ``cameras``: our name of a camera -> name of its picture in the batch, where ``camera_name_mapping`` changes it.

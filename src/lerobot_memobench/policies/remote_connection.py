@@ -36,7 +36,7 @@ LONGEST_LIST = 1 << 16
 PAUSE = 0.5
 """Time between two attempts to connect, s."""
 
-Frame = Mapping[str, Any]
+NamedValues = Mapping[str, Any]
 """Observations of one control step by our names."""
 
 
@@ -90,14 +90,14 @@ class Connection:
     def begin(self, task: str) -> None:
         """Begin an episode, on a new connection."""
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: NamedValues) -> None:
         """Send a frame of the prompt."""
         self.plan(frame)
 
-    def watch(self, frame: Frame) -> None:
+    def watch(self, frame: NamedValues) -> None:
         """Keep a frame of the execution whose action is planned already."""
 
-    def plan(self, frame: Frame) -> dict[str, Any]:
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
         """Return the server's answer to an observation."""
         return self.ask({theirs: frame[ours] for theirs, ours in self.keys.items()})
 
@@ -228,20 +228,20 @@ class RoboMMEConnection(Connection):
 
     def begin(self, task: str) -> None:
         """Clear the server's memory."""
-        self._frames: list[Frame] = []
+        self._frames: list[NamedValues] = []
         self._execution_starts = 0
         self.ask({"reset": True})
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: NamedValues) -> None:
         """Keep a frame for the next question."""
         self._frames.append(frame)
         self._execution_starts += 1
 
-    def watch(self, frame: Frame) -> None:
+    def watch(self, frame: NamedValues) -> None:
         """Keep a frame for the next question."""
         self._frames.append(frame)
 
-    def plan(self, frame: Frame) -> dict[str, Any]:
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
         """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
         self.ask(
@@ -335,14 +335,14 @@ class VlaEvalConnection(Connection):
 
     def begin(self, task: str) -> None:
         """Begin an episode; of its task the server learns the instruction alone."""
-        self._frames: list[Frame] = []
+        self._frames: list[NamedValues] = []
         self.ask({"type": "episode_start", "payload": {"task": {"name": task}}})
 
-    def show(self, frame: Frame) -> None:
+    def show(self, frame: NamedValues) -> None:
         """Keep a frame for the next question."""
         self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in self.keys.values()})
 
-    def plan(self, frame: Frame) -> dict[str, Any]:
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
         """Return the server's answer, with ``actions``; the first question of an episode has its prompt."""
         payload: dict[str, Any] = {}
         for theirs, ours in [*self.keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
