@@ -137,7 +137,7 @@ class Connection:
             return self._greet(patience)
         except InvalidStatus as error:
             code = error.response.status_code
-            if code >= 500:
+            if code >= 500:  # of a proxy, or of a server that starts
                 raise ServerAway(f"HTTP state {code}") from error
             raise self._foreign(f"it answered with HTTP state {code}") from error
         except InvalidHandshake as error:
