@@ -202,19 +202,19 @@ class MEMOBench(StepBenchmark):
 
     def make_obs(self, raw_obs: dict[str, Any], task: dict[str, Any]) -> dict[str, Any]:
         """Return the observation to send; the first one contains the prompt."""
-        found: dict[str, Any] = {
+        sent: dict[str, Any] = {
             "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
             "task_description": self._running().task_description,
             "step": raw_obs["step"],
         }
         if self._send_state:
-            found["states"] = raw_obs["agent_pos"]
+            sent["states"] = raw_obs["agent_pos"]
         if self._settings.robot_state:
-            found["robot_state"] = raw_obs["robot_state"]
+            sent["robot_state"] = raw_obs["robot_state"]
         if self._history:
-            found |= {**self._history, "episode_restart": True}
+            sent |= {**self._history, "episode_restart": True}
             self._history = {}
-        return found
+        return sent
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
         picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
@@ -277,14 +277,14 @@ class MEMOBench(StepBenchmark):
 
 def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
     """Return the actions of a model server's answer, (steps, 7)."""
-    found: Any = answer.get("actions", answer.get("action"))
+    given: Any = answer.get("actions", answer.get("action"))
     try:
-        actions = np.array(found, dtype=np.float32, ndmin=2)
+        actions = np.array(given, dtype=np.float32, ndmin=2)
     except (TypeError, ValueError):
         actions = np.empty((0, 0), np.float32)
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise MemobenchError(
-            f"the model server returned actions of shape {np.shape(found)}; expected numbers of shape ({ACTION_DIM},) "
+            f"the model server returned actions of shape {np.shape(given)}; expected numbers of shape ({ACTION_DIM},) "
             f"or (steps, {ACTION_DIM}): end-effector displacement (6) and gripper (1)"
         )
     return actions

@@ -58,7 +58,6 @@ TINY: dict[str, dict[str, Any]] = {
         "n_encoder_layers": 1,
     },
     "diffusion": {"pretrained_backbone_weights": None, "down_dims": (16, 32), "n_groups": 4},
-    "tdmpc": {"latent_dim": 8, "mlp_dim": 16, "image_encoder_hidden_dim": 8},
 }
 
 

@@ -44,7 +44,7 @@ class CheckOutcome(StrEnum):
 
 PASSED, FAILED, NO_MEMORY, NOT_CHECKED = CheckOutcome
 
-Finding = tuple[CheckOutcome, str]
+CheckVerdict = tuple[CheckOutcome, str]
 """An outcome and its sentence: the problem and its solution."""
 
 
@@ -82,8 +82,8 @@ class Behaviour:
     def changes(self, calls: Iterable[int], shown: Stream | None = None) -> Actions:
         """Return the change of each call's action if a stream, or the second one's last frame, is shown at calls."""
         shown = shown or self.two.only(len(self.two) - 1)
-        found = self.subject.roll([self.one.showing(shown, [*calls])])[:, 0]
-        return np.abs(found - self.alone).max(axis=1)
+        actions = self.subject.roll([self.one.showing(shown, [*calls])])[:, 0]
+        return np.abs(actions - self.alone).max(axis=1)
 
     @cached_property
     def by_frame(self) -> dict[int, Actions]:
@@ -143,7 +143,7 @@ class Behaviour:
 
 # --- the checks, in an order in which later ones rely on earlier ones ---
 
-Check = Callable[[Behaviour], Finding]
+Check = Callable[[Behaviour], CheckVerdict]
 CHECKS: dict[str, Check] = {}
 
 
@@ -151,8 +151,8 @@ def check(name: str, *, of_memory: bool = False) -> Callable[[Check], Check]:
     """Add a function to the checks; one ``of_memory`` is skipped for a policy without."""
 
     def add(function: Check) -> Check:
-        def checked(found: Behaviour) -> Finding:
-            return (NO_MEMORY, "it has no memory") if of_memory and not found.memory else function(found)
+        def checked(behaviour: Behaviour) -> CheckVerdict:
+            return (NO_MEMORY, "it has no memory") if of_memory and not behaviour.memory else function(behaviour)
 
         CHECKS[name] = checked
         return function
@@ -160,29 +160,29 @@ def check(name: str, *, of_memory: bool = False) -> Callable[[Check], Check]:
     return add
 
 
-def run_check(name: str, found: Behaviour) -> Result:
+def run_check(name: str, behaviour: Behaviour) -> Result:
     """Run one check."""
     try:
-        return Result(name, *CHECKS[name](found))
+        return Result(name, *CHECKS[name](behaviour))
     except Exception as error:  # any policy may raise anything
         return Result(name, FAILED, f"the policy raised {type(error).__name__}: {error}")
 
 
 def run_checks(subject: Subject) -> list[Result]:
     """Run all checks in their order."""
-    found = Behaviour(subject)
-    return [run_check(name, found) for name in CHECKS]
+    behaviour = Behaviour(subject)
+    return [run_check(name, behaviour) for name in CHECKS]
 
 
 @check("deterministic given a seed")
-def _is_deterministic(found: Behaviour) -> Finding:
+def _is_deterministic(behaviour: Behaviour) -> CheckVerdict:
     from lerobot.utils.random_utils import set_seed
 
     rolled = []
     for _ in range(2):
         set_seed(1)
-        rolled.append(found.subject.roll([found.one], equal_noise=False)[:, 0])
-    call = found.differ(*rolled)
+        rolled.append(behaviour.subject.roll([behaviour.one], equal_noise=False)[:, 0])
+    call = behaviour.differ(*rolled)
     if call is None:
         return PASSED, "the same seed gives the same actions"
     return FAILED, (
@@ -192,41 +192,41 @@ def _is_deterministic(found: Behaviour) -> Finding:
 
 
 @check("reset forgets")
-def _reset_forgets(found: Behaviour) -> Finding:
+def _reset_forgets(behaviour: Behaviour) -> CheckVerdict:
     before = []
-    for stream in (found.two.until(found.two.start + 4), found.three):
-        found.subject.roll([stream])
-        before.append(found.subject.roll([found.one])[:, 0])
-    call = found.differ(*before)
+    for stream in (behaviour.two.until(behaviour.two.start + 4), behaviour.three):
+        behaviour.subject.roll([stream])
+        before.append(behaviour.subject.roll([behaviour.one])[:, 0])
+    call = behaviour.differ(*before)
     if call is not None:
         return FAILED, f"at call {call} it acts differently after another episode: {RESETS}"
-    found.subject.roll([found.three, found.two])
-    call = found.differ(before[0], found.subject.roll([found.one])[:, 0])
+    behaviour.subject.roll([behaviour.three, behaviour.two])
+    call = behaviour.differ(before[0], behaviour.subject.roll([behaviour.one])[:, 0])
     if call is not None:
         return FAILED, f"at call {call} it acts differently after a batch of more rows: {RESETS}"
     return PASSED, "an episode is the same after any other"
 
 
 @check("remembers")
-def _remembers(found: Behaviour) -> Finding:
-    if found.memory:
-        return PASSED, f"frames of the past change actions by up to {found.memory:.2g}"
+def _remembers(behaviour: Behaviour) -> CheckVerdict:
+    if behaviour.memory:
+        return PASSED, f"frames of the past change actions by up to {behaviour.memory:.2g}"
     return FAILED, (
         "it has no memory: no earlier frame changes a later action; this is correct for a policy without memory"
     )
 
 
 @check("reads the prompt", of_memory=True)
-def _reads_the_prompt(found: Behaviour) -> Finding:
-    if not found.subject.reads_prompt:
+def _reads_the_prompt(behaviour: Behaviour) -> CheckVerdict:
+    if not behaviour.subject.reads_prompt:
         return FAILED, (
             "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
             "True on the class of its configuration"
         )
-    if not found.one.start:
+    if not behaviour.one.start:
         return NOT_CHECKED, "no episode of the dataset has a prompt; name one with prompts, or none"
-    if found.prompt:
-        return PASSED, f"another prompt changes actions by up to {found.prompt:.2g}"
+    if behaviour.prompt:
+        return PASSED, f"another prompt changes actions by up to {behaviour.prompt:.2g}"
     return FAILED, (
         "another prompt changes no action: remember frames while observation.phase is 0, and keep them when it "
         "becomes 1"
@@ -234,8 +234,8 @@ def _reads_the_prompt(found: Behaviour) -> Finding:
 
 
 @check("plans after the prompt")
-def _plans_after_prompt(found: Behaviour) -> Finding:
-    if found.one.start in found.plans:
+def _plans_after_prompt(behaviour: Behaviour) -> CheckVerdict:
+    if behaviour.one.start in behaviour.plans:
         return PASSED, "the first execution frame decides the first action"
     return FAILED, (
         "the first action of the execution does not depend on its first frame, but was planned in the prompt: clear a "
@@ -244,52 +244,52 @@ def _plans_after_prompt(found: Behaviour) -> Finding:
 
 
 @check("remembers every control step", of_memory=True)
-def _remembers_every_step(found: Behaviour) -> Finding:
-    finding = _remembers_between_plans(found)
+def _remembers_every_step(behaviour: Behaviour) -> CheckVerdict:
+    subject, verdict = behaviour.subject, _remembers_between_plans(behaviour)
     # Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
-    for steps in INTERVALS if finding[0] is FAILED and hasattr(found.subject.policy.config, "n_action_steps") else ():
+    for steps in INTERVALS if verdict[0] is FAILED and hasattr(subject.policy.config, "n_action_steps") else ():
         # A policy may refuse an interval, such as one longer than its chunks.
-        with found.subject.planning_every(steps), contextlib.suppress(Exception):
-            other = _remembers_between_plans(Behaviour(found.subject))
+        with subject.planning_every(steps), contextlib.suppress(Exception):
+            other = _remembers_between_plans(Behaviour(subject))
             if other[0] is PASSED:
                 return other
-    return finding
+    return verdict
 
 
-def _remembers_between_plans(found: Behaviour) -> Finding:
-    between = [frame for frame in found.by_frame if frame not in found.plans]
+def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
+    between = [frame for frame in behaviour.by_frame if frame not in behaviour.plans]
     if not between:
         return PASSED, "it plans at every control step"
-    if any(found.later(frame) for frame in between):
+    if any(behaviour.later(frame) for frame in between):
         return PASSED, "frames between two plans change later ones"
-    if any(found.later(frame) for frame in found.plans):
+    if any(behaviour.later(frame) for frame in behaviour.plans):
         return FAILED, (
             "frames at which it plans are remembered, those between two plans are not, so its history depends on "
             "n_action_steps: remember the frame at every call of select_action, also while actions are queued"
         )
     return NOT_CHECKED, (
-        f"none of {len(found.one) - found.one.start} execution frames changes a later plan: it remembers the prompt "
-        "alone, or has a long stride; set a smaller one, for example policy.memory_stride=2"
+        f"none of {len(behaviour.one) - behaviour.one.start} execution frames changes a later plan: it remembers the "
+        "prompt alone, or has a long stride; set a smaller one, for example policy.memory_stride=2"
     )
 
 
 @check("rows are independent")
-def _rows_are_independent(found: Behaviour) -> Finding:
-    roll, one = found.subject.roll, found.one
+def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
+    roll, one = behaviour.subject.roll, behaviour.one
     # The other rows begin at other steps.
-    between = roll([found.two, one, found.three])[:, 1]
-    others = roll([found.three, one, found.two])[:, 1]
-    for other, batch in ((others, "with other rows in its batch"), (found.alone, "alone in its batch")):
-        call = found.differ(between, other)
+    between = roll([behaviour.two, one, behaviour.three])[:, 1]
+    others = roll([behaviour.three, one, behaviour.two])[:, 1]
+    for other, batch in ((others, "with other rows in its batch"), (behaviour.alone, "alone in its batch")):
+        call = behaviour.differ(between, other)
         if call is not None:
             return FAILED, f"at call {call} a row acts differently {batch}: {BY_ROW}"
     return PASSED, "a row acts alike alone and with other rows"
 
 
 @check("finished rows change no other")
-def _finished_rows_change_no_other(found: Behaviour) -> Finding:
-    over = found.two.until(found.two.start + 4)
-    call = found.differ(found.subject.roll([over, found.one])[:, 1], found.after_two)
+def _finished_rows_change_no_other(behaviour: Behaviour) -> CheckVerdict:
+    over = behaviour.two.until(behaviour.two.start + 4)
+    call = behaviour.differ(behaviour.subject.roll([over, behaviour.one])[:, 1], behaviour.after_two)
     if call is None:
         return PASSED, "finished rows change no other row"
     return FAILED, (
@@ -298,23 +298,23 @@ def _finished_rows_change_no_other(found: Behaviour) -> Finding:
 
 
 @check("same history in training")
-def _same_history_in_training(found: Behaviour) -> Finding:
-    plans = sorted({*found.plans, *found.all_plans[-COMPARED:]})  # a hold may have thousands
+def _same_history_in_training(behaviour: Behaviour) -> CheckVerdict:
+    plans = sorted({*behaviour.plans, *behaviour.all_plans[-COMPARED:]})  # a hold may have thousands
     if not plans:
         return NOT_CHECKED, "no frame changes the action of its own call, so the beginning of a chunk is unknown"
     try:
-        predicted = found.subject.predict(found.one, plans)
+        predicted = behaviour.subject.predict(behaviour.one, plans)
     except Exception as error:
         reason = str(error).splitlines()[0][:80] if str(error) else ""
         return NOT_CHECKED, (
             f"predict_action_chunk does not accept a training batch ({type(error).__name__}: {reason}); let it read "
             "the history in the batch, as forward does"
         )
-    call = found.differ(predicted, found.alone[plans])
+    call = behaviour.differ(predicted, behaviour.alone[plans])
     if call is None:
         return PASSED, f"{len(plans)} training samples have the actions of the rollout"
-    present = np.stack([found.subject.roll([found.one.only(plan)])[0, 0] for plan in plans])
-    if found.memory and found.differ(predicted, present) is None:
+    present = np.stack([behaviour.subject.roll([behaviour.one.only(plan)])[0, 0] for plan in plans])
+    if behaviour.memory and behaviour.differ(predicted, present) is None:
         return NOT_CHECKED, (
             "predict_action_chunk reads only the present frames of a training batch; let it read the history in the "
             "batch, as forward does"
@@ -326,8 +326,9 @@ def _same_history_in_training(found: Behaviour) -> Finding:
 
 
 @check("needs_observation is true")
-def _needs_observation_is_true(found: Behaviour) -> Finding:
-    call = found.differ(found.subject.roll([found.two, found.one], sparing=True)[:, 1], found.after_two)
+def _needs_observation_is_true(behaviour: Behaviour) -> CheckVerdict:
+    sparing = behaviour.subject.roll([behaviour.two, behaviour.one], sparing=True)[:, 1]
+    call = behaviour.differ(sparing, behaviour.after_two)
     if call is None:
         return PASSED, "unnecessary frames have no effect"
     return FAILED, (

@@ -39,19 +39,15 @@ def write_streams(
 
 
 def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
-    """Return a task with checkpoints that a memory knows, preferably with a prompt and many checkpoints.
-
-    Args:
-        subgoals: instruction -> texts that the memory was trained with. If no task fits, `TASK` is returned.
-    """
+    """Return a task for a memory's texts of each instruction, preferably with a prompt and many checkpoints."""
     known = {text for own in subgoals.values() for text in own}
 
     def fits(task: Task) -> bool:
         levels = zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
         return task.language in subgoals and any(known.issuperset(texts) for texts in levels)
 
-    found = filter(fits, map(get_task, task_names(suite=None)))
-    best = max(found, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
+    fitting = filter(fits, map(get_task, task_names(suite=None)))
+    best = max(fitting, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
     return TASK if best is None else best.name
 
 
@@ -90,12 +86,12 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
 
 def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a coloured square that moves along places (T, 2) in [-1, 1]."""
-    found = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+    pictures = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
     corners = ((places + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
-    for picture, (top, left) in zip(found, corners, strict=True):
+    for picture, (top, left) in zip(pictures, corners, strict=True):
         picture[top : top + side, left : left + side] = colour
-    return found
+    return pictures
 
 
 @dataclass(frozen=True)
@@ -146,24 +142,23 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     Args:
         dataset: without delta timestamps.
         pictures: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first. If not,
-            streams have the order of the dataset.
+        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
         frames: number of execution frames that are not held.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
     table = read_frame_table(Path(dataset.root))
-    found: list[tuple[bool, tuple[int, ...], str]] = []
+    episodes: list[tuple[bool, tuple[int, ...], str]] = []
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         acting = (first + np.flatnonzero(table.acts[first:end])[:frames]).tolist()
         if acting:
             indices = range(first, acting[-1] + 1) if prompts else acting
             prompted = float(dataset.hf_dataset[first][OBS_PHASE]) != EXECUTION
-            found.append((not prompted, tuple(indices), episode["tasks"][0]))
+            episodes.append((not prompted, tuple(indices), episode["tasks"][0]))
     if prompts:
-        found.sort(key=lambda one: (one[0], len(one[1])))
-    for _, indices, task in found:
+        episodes.sort(key=lambda one: (one[0], len(one[1])))
+    for _, indices, task in episodes:
         shown: list[dict[str, Tensor]] = []
         for index in indices:
             item = dataset[index] if pictures else dataset.hf_dataset[index]

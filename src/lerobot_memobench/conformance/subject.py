@@ -132,11 +132,11 @@ class EqualNoise(TorchFunctionMode):
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call a function of torch, and replace the values that it drew."""
-        found = function(*args, **(kwargs or {}))
+        drawn = function(*args, **(kwargs or {}))
         if function in self.DRAWS:
-            width = found.shape[-1] if found.dim() > 1 else 1
-            found.copy_(torch.rand(width, generator=torch.Generator().manual_seed(width)).to(found))
-        return found
+            width = drawn.shape[-1] if drawn.dim() > 1 else 1
+            drawn.copy_(torch.rand(width, generator=torch.Generator().manual_seed(width)).to(drawn))
+        return drawn
 
 
 def load_subject(words: Sequence[str], folder: Path) -> Subject:
@@ -224,8 +224,8 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     policy.eval()
     shown = obs_type_of(config) or PIXELS
     objects = objects_column(raw.meta.features) if shown in (OBJECTS, BOTH) else None
-    found = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
-    streams = [*itertools.islice(found, STREAMS)]
+    episodes = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
+    streams = [*itertools.islice(episodes, STREAMS)]
     if len(streams) < STREAMS:
         raise MemobenchError(f"{raw.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none")
     return Subject(config.type, policy, before, after, dataset, streams, raw.meta.camera_keys, numbers)

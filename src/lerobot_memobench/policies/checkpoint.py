@@ -62,7 +62,7 @@ class _StepConfig(TypedDict, total=False):
     rename_map: dict[str, str]
 
 
-class Step(TypedDict, total=False):
+class SavedStep(TypedDict, total=False):
     """A step of a processor; ``config`` of those that normalise or rename."""
 
     registry_name: str
@@ -71,7 +71,7 @@ class Step(TypedDict, total=False):
 
 
 class _Processor(TypedDict, total=False):
-    steps: list[Step]
+    steps: list[SavedStep]
 
 
 class _TrainedOn(TypedDict, total=False):
@@ -131,8 +131,8 @@ def _through_last(path: Path) -> Path:
     """Replace ``checkpoints/last`` in a path by the checkpoint that it named, if a copy lost the link."""
     for last in (path, path.parent):
         if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
-            found = checkpoints_of(last.parent.parent)
-            return found[0] / path.relative_to(last) if found else path
+            checkpoints = checkpoints_of(last.parent.parent)
+            return checkpoints[0] / path.relative_to(last) if checkpoints else path
     return path
 
 
@@ -241,7 +241,7 @@ def check_statistics(source: str | Path, revision: str | None = None) -> None:
                 )
 
 
-def _normalised(step: Step, processor: str) -> Iterator[str]:
+def _normalised(step: SavedStep, processor: str) -> Iterator[str]:
     config = step.get("config", {})
     modes = config.get("norm_map", {})
     for key, feature in config.get("features", {}).items():
@@ -276,9 +276,10 @@ def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
     if not isinstance(name, str) or "class" in step:
         yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
         return
-    found = _registered(name, kind)
-    if found is None or not _trusted(found.__module__.partition(".")[0]):
-        yield f"names the step {name!r}, which {'no package' if found is None else found.__module__} registers"
+    registered = _registered(name, kind)
+    if registered is None or not _trusted(registered.__module__.partition(".")[0]):
+        package = "no package" if registered is None else registered.__module__
+        yield f"names the step {name!r}, which {package} registers"
     yield from (f"holds {key!r} in the settings of the step {name!r}, which would name code" for key in _naming(config))
     if config.get("trust_remote_code") is not False:
         for setting, known in REMOTE_CODE.items():
@@ -422,11 +423,11 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     """Return shapes by the names under which the policy loads them: pi0 and its relatives rename tensors."""
     import torch
 
-    renamed = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if renamed is None or type(policy).__module__.startswith(f"{__package__}."):
+    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if rename is None or type(policy).__module__.startswith(f"{__package__}."):
         return shapes
-    found = renamed({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
-    return {name if name.startswith("model.") else f"model.{name}": tuple(value.shape) for name, value in found.items()}
+    tensors = rename({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
+    return {f"model.{name.removeprefix('model.')}": tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
 def statistics_shapes(source: str | Path) -> dict[str, tuple[int, ...]]:
@@ -453,20 +454,20 @@ def training_of(source: str | Path) -> dict[str, Any]:
 
 def trained_names(source: str | Path) -> dict[str, str]:
     """Return the ``rename_map`` of a source's training: names in its data -> names of the policy."""
-    if found := training_of(source).get("rename_map"):
-        return dict(found)
+    if rename_map := training_of(source).get("rename_map"):
+        return dict(rename_map)
     file = _file_of(source, PREPROCESSOR_FILE)
     configs = [step.get("config", {}) for step in steps_of(file) if step.get("registry_name") == RENAMING]
     return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
-def steps_of(file: Path | None) -> list[Step]:
+def steps_of(file: Path | None) -> list[SavedStep]:
     """Return the steps in the file of a processor; none without a file."""
-    steps: list[Step] = [] if file is None else read_json(file, _Processor).get("steps", [])
+    steps: list[SavedStep] = [] if file is None else read_json(file, _Processor).get("steps", [])
     return steps
 
 
-def _normalises(step: Step) -> bool:
+def _normalises(step: SavedStep) -> bool:
     return str(step.get("registry_name", "")).endswith("normalizer_processor")
 
 

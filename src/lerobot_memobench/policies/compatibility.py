@@ -81,7 +81,6 @@ def check_features(
     that read pictures of any size, would act on inputs unlike their training data.
 
     Args:
-        path: folder of the checkpoint, or a repository. policy: its configuration.
         shown: features of the environment's observations and action, by LeRobot's names.
         renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
     """
@@ -132,15 +131,15 @@ def _check_cameras(path: str, cameras: list[str], original: Mapping[str, str]) -
     if not missing:
         return
     free = [known for name, known in original.items() if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
-    found = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
+    inputs = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
     if len(free) < len(missing):
         raise MemobenchError(
-            f"{found}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
+            f"{inputs}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
             "this environment"
         )
     mapped = {name: known for known, name in original.items() if known in cameras and known != name}
     guess = json.dumps(mapped | dict(zip(free, missing, strict=False)))
-    raise MemobenchError(f"{found}; map its names, for example by --rename_map='{guess}'")
+    raise MemobenchError(f"{inputs}; map its names, for example by --rename_map='{guess}'")
 
 
 def _list(original: Mapping[str, str]) -> str:
@@ -207,44 +206,40 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
 def chosen_convention(
     path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
 ) -> str | None:
-    """Return the convention of the pictures for a policy: the one that was asked for, else that of its training.
+    """Return the convention of the pictures for a policy: ``asked``, else that of its training.
 
-    None if none was and the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused;
-    so is none where the policy's is unclear.
-
-    Args:
-        path: folder or repository of its checkpoint, or None. policy: its configuration.
-        asked: the convention that was named, None if none was.
-        rename_map: of the evaluation. It may name the wrist camera of a convention, but it does not mirror pictures.
+    None if the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused; so is none
+    where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
+    mirror pictures.
     """
     if asked is not None:
         check_choice("convention", asked, [*WRIST])
-    found: str | None = UPRIGHT
+    own: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
     elif path is None or not policy.image_features:
         return asked
     else:
-        found, why = trained_convention(path, policy)
+        own, why = trained_convention(path, policy)
     name = path or policy.type
     command = f"lerobot eval env=memobench policy={name} convention="
-    if found is None and asked is None:
+    if own is None and asked is None:
         raise MemobenchError(
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
     mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
     for other in (asked, *mapped):
-        if found is not None and other not in (None, found):
+        if own is not None and other not in (None, own):
             where = "" if other == asked else " in rename_map, which does not mirror pictures"
             raise MemobenchError(
-                f"the policy {name} expects pictures of convention={found} ({why}), and found {other}{where}; run "
-                f"`{command}{found}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
-                f"--env.convention={found}`"
+                f"the policy {name} expects pictures of convention={own} ({why}), and found {other}{where}; run "
+                f"`{command}{own}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
+                f"--env.convention={own}`"
             )
-    if asked is None and found != UPRIGHT:
-        logger.warning("pictures have convention=%s, as in the training of %s (%s)", found, name, why)
-    return asked or found
+    if asked is None and own != UPRIGHT:
+        logger.warning("pictures have convention=%s, as in the training of %s (%s)", own, name, why)
+    return asked or own
 
 
 # --- the clock of observations ---

@@ -51,9 +51,9 @@ def encoded(policy: Any) -> dict[str, Any]:
     """Return a policy's configuration as plain JSON values."""
     import draccus
 
-    found = json.loads(json.dumps(draccus.encode(policy), default=str))
-    assert isinstance(found, dict)
-    return {**found, "type": policy.type}
+    values = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(values, dict)
+    return {**values, "type": policy.type}
 
 
 def check_sizes(policy: Any) -> None:
@@ -79,11 +79,11 @@ def has_device(device: str) -> bool:
     from lerobot.utils.device_utils import is_torch_device_available
 
     try:
-        found = torch.device(device)
-        available = is_torch_device_available(found.type)
+        asked = torch.device(device)
+        available = is_torch_device_available(asked.type)
     except (RuntimeError, ValueError):  # there is no such type
         return False
-    return available and (found.type != "cuda" or (found.index or 0) < torch.cuda.device_count())
+    return available and (asked.type != "cuda" or (asked.index or 0) < torch.cuda.device_count())
 
 
 def check_device(device: str | None) -> None:
@@ -99,14 +99,7 @@ def check_device(device: str | None) -> None:
 
 
 def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the episode log.
-
-    Args:
-        policy: its configuration.
-        path: its checkpoint; None for a policy without one.
-        seeds: seeds of the requested episodes, see `Acting`.
-        settings: settings of its environments.
-    """
+    """Return the description of a policy for the episode log; ``seeds``: of the requested episodes, see `Acting`."""
     run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
     return Acting(_identity(policy, path), inputs, run, seeds)
@@ -123,8 +116,8 @@ def _identity(policy: Any, path: str | None) -> dict[str, Any]:
         if key not in (*ELSEWHERE, "type") and before.get(key) != value
     }
     facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)
-    found = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
-    return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
+    identity = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
+    return identity | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
 
 
 def _default_config(policy: Any, path: str | None) -> Any:

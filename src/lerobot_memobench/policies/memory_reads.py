@@ -32,13 +32,11 @@ MEMORY_READS = "memory_reads"
 
 
 class Chunk(TypedDict):
-    """The reads of one action chunk.
+    """The reads of one action chunk. Steps are control steps, counted from the policy's first observation.
 
     Attributes:
-        step: control step of the plan, counted from the policy's first observation; this is the execution's first if
-            the prompt plays in ``reset``.
-        entries: control steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as
-            slots.
+        step: of the plan.
+        entries: steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as slots.
         weights: share of attention on each entry; the sum is one if only memory is attended to.
     """
 
@@ -48,15 +46,10 @@ class Chunk(TypedDict):
 
 
 class EpisodeReads(TypedDict):
-    """The content of a file.
-
-    Attributes:
-        seed: the seed of episode 0 plus the episode's number. The log has the scene's seed, shared by its variants.
-        referent: of the episode, as in the log.
-        chunks: in the order of their plans.
-    """
+    """The content of a file, with chunks in the order of their plans."""
 
     seed: Whole
+    """The seed of episode 0 plus the episode's number. The log has the scene's seed, shared by its variants."""
     referent: Name
     chunks: list[Chunk]
 
@@ -115,9 +108,6 @@ def noting_reads(
 
     Args:
         folder: of the episode log. settings: of the environments. seeds: of the rows.
-
-    Raises:
-        MemobenchError: the policy cannot report its reads.
     """
     policy.watch_memory()
     written = np.zeros(len(seeds), bool)
@@ -148,7 +138,7 @@ def find_reads(
     rollouts with pauses have no chunks.
     """
     unseen = protocol.get("prompt_in") == RESET
-    found: dict[int, list[Chunk]] = {}
+    chunks_of: dict[int, list[Chunk]] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
         try:
@@ -172,10 +162,10 @@ def find_reads(
         if not _fit(reads, chunks, record):
             misfits.append(f"{path} is not of the rollout in the log")
         elif not record.get("paused_steps"):
-            found[k] = chunks
+            chunks_of[k] = chunks
     if not misfits:
-        return found, []
-    return found, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
+        return chunks_of, []
+    return chunks_of, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
 
 
 def _fit(reads: EpisodeReads, chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:

@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from operator import call
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,7 +34,7 @@ from lerobot_memobench.policies.remote_connection import (
     TASK,
     WRIST_IMAGE,
     Connection,
-    Frame,
+    NamedValues,
 )
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED, WRIST
@@ -233,11 +232,9 @@ class RemotePolicy(UntrainedPolicy):
         while len(self._clients) < count:
             self._add_client()
         batch = _flat(batch)
-        jobs = [
-            partial(client.act, Observation(batch, index, self._cameras))
-            for index, client in enumerate(self._clients[:count])
-        ]
-        return torch.from_numpy(np.stack([job() for job in jobs] if count == 1 else [*self._pool.map(call, jobs)]))
+        observations = [EnvObservation(batch, index, self._cameras) for index in range(count)]
+        each = map if count == 1 else self._pool.map
+        return torch.from_numpy(np.stack([*each(Client.act, self._clients, observations)]))
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -252,8 +249,8 @@ class Client:
     """
 
     def __init__(self, config: RemoteConfig, address: str) -> None:
-        self._config, self._keys = config, config.sent()
-        self._connection = config.connection(address, config.timeout)
+        self._config = config
+        self._connection = config.connection(address, config.timeout, config.sent())
         self._stated: str | None = None  # the convention that the server states; None: not connected
         self._used = False  # whether the connection has served an episode
         self.forget()
@@ -261,9 +258,9 @@ class Client:
     def connect(self) -> None:
         """Connect within ``connect_timeout``, so that a missing server is an error before any simulation."""
         if self._stated is None:
-            found = self._connection.open(self._config.connect_timeout)
-            logger.info("connected with the policy server at %s: %s", self._connection.address, short(found))
-            self._stated = str(found.get(STATED))
+            metadata = self._connection.open(self._config.connect_timeout)
+            logger.info("connected with the policy server at %s: %s", self._connection.address, short(metadata))
+            self._stated = str(metadata.get(STATED))
 
     def forget(self) -> None:
         """Begin a rollout: the next observation is of another episode."""
@@ -271,7 +268,7 @@ class Client:
         self._prompt = self._rests = False
         self._queue: deque[Action] = deque()
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: EnvObservation) -> Action:
         """Return the action (7,) for the present observation, queued or of a new answer."""
         step, phase = observation.scalar(STEP), observation.scalar("phase")
         last, self._clock = self._clock, self._now(step, phase)
@@ -281,20 +278,17 @@ class Client:
             return np.zeros(ACTION_DIM, np.float32)  # the episode has ended, or is not simulated
         if begins:
             self._begin(observation)
-        if phase not in (None, EXECUTION):  # actions have no effect
-            self._prompt = True
+        self._prompt = phase not in (None, EXECUTION)
+        if self._prompt:  # actions have no effect
             if self._shows_prompt(self._clock[1]):
-                self._connection.show(self._frame(observation), self._keys)
+                self._connection.show(self._frame(observation))
             return np.zeros(ACTION_DIM, np.float32)
-        if self._prompt:
-            self._connection.end_prompt()
-            self._prompt = False
         if not self._queue:
-            answer = self._connection.plan(self._frame(observation), self._keys)
+            answer = self._connection.plan(self._frame(observation))
             actions = read_actions(answer, self._config, self._connection.address)
             self._queue.extend(actions[: self._config.n_action_steps])
         elif self._config.connection.buffers:
-            self._connection.watch(self._frame(observation), self._keys)
+            self._connection.watch(self._frame(observation))
         return self._queue.popleft()
 
     def _now(self, step: int | None, phase: int | None) -> tuple[int, int]:
@@ -302,7 +296,7 @@ class Client:
             return EXECUTION, 0 if self._clock is None else self._clock[1] + 1
         return EXECUTION if phase is None else phase, step
 
-    def _begin(self, observation: Observation) -> None:
+    def _begin(self, observation: EnvObservation) -> None:
         """Start an episode on a connection of its own; the server's memory is cleared."""
         self.connect()
         shown = observation.convention
@@ -313,7 +307,7 @@ class Client:
             )
         if self._used:
             self._connection.open(self._config.connect_timeout)
-        self._used, self._prompt = True, False
+        self._used = True
         self._queue.clear()
         self._connection.begin(observation.get(TASK))
 
@@ -328,13 +322,13 @@ class Client:
     def _shows_prompt(self, step: int) -> bool:
         return self._config.send_prompt and step % self._config.prompt_stride == 0
 
-    def _frame(self, observation: Observation) -> Frame:
+    def _frame(self, observation: EnvObservation) -> NamedValues:
         """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
-        found = {name: observation.get(name) for name in (*buffered, *self._keys.values())}
+        values = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
         if observation.scalar(STEP) is not None:
-            found[STEP] = observation.get(STEP)
-        return {name: fit(value, self._config.side) if np.ndim(value) == 3 else value for name, value in found.items()}
+            values[STEP] = observation.get(STEP)
+        return {name: fit(value, self._config.side) if np.ndim(value) == 3 else value for name, value in values.items()}
 
 
 def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) -> NDArray[np.float32]:
@@ -343,10 +337,11 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
     Infinite actions are returned too: the environment ends that episode, and the others continue.
     """
 
-    def wrong(found: str) -> MemobenchError:
+    def wrong(problem: str) -> MemobenchError:
         return MemobenchError(
-            f"the policy server at {address} answered {found}; expected finite numbers of shape (steps, {ACTION_DIM}), "
-            f"at most {MOST_ACTIONS:,} steps: six numbers of the end effector's displacement and one of the gripper"
+            f"the policy server at {address} answered {problem}; expected finite numbers of shape (steps, "
+            f"{ACTION_DIM}), at most {MOST_ACTIONS:,} steps: six numbers of the end effector's displacement and one of "
+            "the gripper"
         )
 
     if "actions" not in answer:
@@ -369,7 +364,7 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
 
 
 @dataclass(frozen=True)
-class Observation:
+class EnvObservation:
     """One environment's observation in a batch; values are copied on access.
 
     ``cameras``: our name of a camera -> name of its picture in the batch, where ``camera_name_mapping`` changes it.
@@ -392,8 +387,8 @@ class Observation:
     @property
     def blank(self) -> bool:
         """Whether this environment is not simulated: its episode is already in the log, and its observation is zero."""
-        found = [value[self.env_index] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
-        return bool(found) and not any(bool(value.any()) for value in found)
+        values = [value[self.env_index] for key, value in self.batch.items() if key == OBS_STATE or OBS_IMAGES in key]
+        return bool(values) and not any(bool(value.any()) for value in values)
 
     def get(self, name: str) -> Any:
         """Return an observation by our name: an image (H, W, 3) uint8, a vector float32, or the instruction."""

@@ -36,7 +36,7 @@ LONGEST_LIST = 1 << 16
 PAUSE = 0.5
 """Time between two attempts to connect, s."""
 
-Frame = Mapping[str, Any]
+NamedValues = Mapping[str, Any]
 """Observations of one control step by our names."""
 
 
@@ -62,13 +62,13 @@ class Connection:
         queues: the server answers one action and queues the rest of its plan.
 
     Args:
-        address: ``ws://host:port``. timeout: longest time of an answer, s.
+        address: ``ws://host:port``. timeout: longest time of an answer, s. keys: in place of the dialect's.
     """
 
     # openpi: examples/libero/main.py, src/openpi/serving/websocket_policy_server.py, openpi-client 0.1.2
     protocol: ClassVar[str] = "openpi's websocket protocol"
     port: ClassVar[int] = 8000
-    keys: ClassVar[Mapping[str, str]] = {
+    keys: Mapping[str, str] = {
         "observation/image": IMAGE,
         "observation/wrist_image": WRIST_IMAGE,
         "observation/state": STATE,
@@ -80,8 +80,8 @@ class Connection:
     buffers: ClassVar[bool] = False
     queues: ClassVar[bool] = False
 
-    def __init__(self, address: str, timeout: float) -> None:
-        self.address, self.timeout = address, timeout
+    def __init__(self, address: str, timeout: float, keys: Mapping[str, str] | None = None) -> None:
+        self.address, self.timeout, self.keys = address, timeout, keys or self.keys
         self._stack = ExitStack()
         self._connection: ClientConnection | None = None
 
@@ -90,19 +90,16 @@ class Connection:
     def begin(self, task: str) -> None:
         """Begin an episode, on a new connection."""
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: NamedValues) -> None:
         """Send a frame of the prompt."""
-        self.plan(frame, keys)
+        self.plan(frame)
 
-    def end_prompt(self) -> None:
-        """Note that all frames so far belong to the prompt."""
-
-    def watch(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def watch(self, frame: NamedValues) -> None:
         """Keep a frame of the execution whose action is planned already."""
 
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
-        """Return the server's answer to an observation; ``keys``: the server's name -> our name of what is sent."""
-        return self.ask({theirs: frame[ours] for theirs, ours in keys.items()})
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
+        """Return the server's answer to an observation."""
+        return self.ask({theirs: frame[ours] for theirs, ours in self.keys.items()})
 
     # --- messages ---
 
@@ -140,7 +137,7 @@ class Connection:
             return self._greet(patience)
         except InvalidStatus as error:
             code = error.response.status_code
-            if code >= 500:
+            if code >= 500:  # of a proxy, or of a server that starts
                 raise ServerAway(f"HTTP state {code}") from error
             raise self._foreign(f"it answered with HTTP state {code}") from error
         except InvalidHandshake as error:
@@ -231,24 +228,22 @@ class RoboMMEConnection(Connection):
 
     def begin(self, task: str) -> None:
         """Clear the server's memory."""
-        self._frames: list[Frame] = []
-        self._sent = self._execution_starts = 0
+        self._frames: list[NamedValues] = []
+        self._execution_starts = 0
         self.ask({"reset": True})
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: NamedValues) -> None:
+        """Keep a frame for the next question."""
+        self._frames.append(frame)
+        self._execution_starts += 1
+
+    def watch(self, frame: NamedValues) -> None:
         """Keep a frame for the next question."""
         self._frames.append(frame)
 
-    watch = show
-
-    def end_prompt(self) -> None:
-        """Note that all frames so far belong to the prompt."""
-        self._execution_starts = self._sent + len(self._frames)
-
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
         """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
-        self._sent += len(frames)
         self.ask(
             {
                 "images": np.stack([frame[IMAGE] for frame in frames])[:, None],
@@ -257,7 +252,7 @@ class RoboMMEConnection(Connection):
                 "exec_start_idx": self._execution_starts,
             }
         )
-        return super().plan(frame, keys)
+        return super().plan(frame)
 
 
 # --- openpi's format ---
@@ -285,14 +280,14 @@ def unpack(data: bytes) -> Any:
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)
 
 
-def _unpack(found: dict[Any, Any]) -> Any:
-    if "__ndarray__" in found:
-        return _array(found["data"], found["dtype"], found["shape"])
-    if b"__ndarray__" in found:
-        return _array(found[b"data"], found[b"dtype"], found[b"shape"])
-    if b"__npgeneric__" in found:
-        return _dtype(found[b"dtype"]).type(found[b"data"])  # of the data's length, whatever length dtype names
-    return found
+def _unpack(packed: dict[Any, Any]) -> Any:
+    if "__ndarray__" in packed:
+        return _array(packed["data"], packed["dtype"], packed["shape"])
+    if b"__ndarray__" in packed:
+        return _array(packed[b"data"], packed[b"dtype"], packed[b"shape"])
+    if b"__npgeneric__" in packed:
+        return _dtype(packed[b"dtype"]).type(packed[b"data"])  # of the data's length, whatever length dtype names
+    return packed
 
 
 def _array(data: bytes, dtype: Any, shape: Any) -> np.ndarray:
@@ -336,23 +331,21 @@ class VlaEvalConnection(Connection):
     keys = {"images.agentview": IMAGE, "images.wrist": WRIST_IMAGE, "states": STATE, "task_description": TASK}
     image_size, n_action_steps, prompt_stride, queues = None, 1, 1, True
 
-    def __init__(self, address: str, timeout: float) -> None:
-        super().__init__(address, timeout)
-        self._number, self._in_episode, self._warned = 0, False, False
+    _number, _in_episode, _warned = 0, False, False
 
     def begin(self, task: str) -> None:
         """Begin an episode; of its task the server learns the instruction alone."""
-        self._frames: list[Frame] = []
+        self._frames: list[NamedValues] = []
         self.ask({"type": "episode_start", "payload": {"task": {"name": task}}})
 
-    def show(self, frame: Frame, keys: Mapping[str, str]) -> None:
+    def show(self, frame: NamedValues) -> None:
         """Keep a frame for the next question."""
-        self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in keys.values()})
+        self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in self.keys.values()})
 
-    def plan(self, frame: Frame, keys: Mapping[str, str]) -> dict[str, Any]:
+    def plan(self, frame: NamedValues) -> dict[str, Any]:
         """Return the server's answer, with ``actions``; the first question of an episode has its prompt."""
         payload: dict[str, Any] = {}
-        for theirs, ours in [*keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
+        for theirs, ours in [*self.keys.items(), *([(STEP, STEP)] if STEP in frame else [])]:
             outer, point, inner = theirs.partition(".")
             if point:
                 payload.setdefault(outer, {})[inner] = _as_png(frame[ours])
@@ -367,30 +360,30 @@ class VlaEvalConnection(Connection):
     def _greet(self, patience: float) -> dict[str, Any]:
         """Send hello; return the server's name and version from its answer, and the convention that it states."""
         self._say("hello", {"harness_version": VERSION, "protocol_version": PROTOCOL, "benchmark": "MEMOBench"})
-        kind, found = self._hear(patience)
+        kind, payload = self._hear(patience)
         if kind != "hello":
             raise self._foreign(f"it answered a hello with {short(kind)}")
-        if (version := short(found.get("protocol_version"))) != str(PROTOCOL):
+        if (version := short(payload.get("protocol_version"))) != str(PROTOCOL):
             raise MemobenchError(
                 f"the policy server at {self.address} has version {version} of {self.protocol}; expected version "
                 f"{PROTOCOL}: serve the policy with vla-eval {VERSION}"
             )
-        if not self._warned and (others := _other_formats(found)):
+        if not self._warned and (others := _other_formats(payload)):
             logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
         self._warned = True
-        asked = found.get("observation_params")
+        asked = payload.get("observation_params")
         stated = {STATED: asked[STATED]} if isinstance(asked, dict) and STATED in asked else {}
-        return stated | {name: found[name] for name in ("model_server", "harness_version") if name in found}
+        return stated | {name: payload[name] for name in ("model_server", "harness_version") if name in payload}
 
     def _exchange(self, question: dict[str, Any]) -> dict[str, Any]:
         self._say(question["type"], question["payload"])
         if question["type"] == "episode_start":
             self._in_episode = True
             return {}
-        kind, found = self._hear(self.timeout)
+        kind, payload = self._hear(self.timeout)
         if kind != "action":
             raise self._foreign(f"it answered an observation with {short(kind)}")
-        return {"actions": found["action"], **found} if "action" in found else found
+        return {"actions": payload["action"], **payload} if "action" in payload else payload
 
     def _say(self, kind: str, payload: dict[str, Any]) -> None:
         self._number += 1
@@ -399,8 +392,8 @@ class VlaEvalConnection(Connection):
 
     def _hear(self, patience: float) -> tuple[str, dict[str, Any]]:
         """Return type and payload of the next frame."""
-        found = self._receive(patience)
-        kind, payload = (found.get("type"), found.get("payload")) if isinstance(found, dict) else (None, None)
+        frame = self._receive(patience)
+        kind, payload = (frame.get("type"), frame.get("payload")) if isinstance(frame, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(payload, dict):
             raise self._foreign("its frames have no type and payload")
         if kind == "error":
