@@ -60,7 +60,7 @@ def evaluate(file: Path, folder: Path, pictures: Callable[[], Pictures]) -> str:
     found = figures(*outcomes(localising(ObjectLocalizer(detector)), pictures()))
     folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / NUMBERS, json.dumps(found, indent=1, allow_nan=False))
-    text = markdown(found)
+    text = results_table(found)
     write_file(folder / TABLE, text)
     return text
 
@@ -173,7 +173,7 @@ def _percentile(values: NDArray[Any], percent: int) -> float | None:
     return round(found, 4) if math.isfinite(found) else None
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
+def results_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table of `figures`."""
     cells = [
         [

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
@@ -309,15 +308,3 @@ def test_other_peoples_files_are_left_alone(run: Path, tmp_path: Path, name: str
     assert (tmp_path / "out" / name).read_text() == "mine"
     with pytest.raises(MemobenchError, match="is a file"):
         write_html([run], tmp_path / "out" / name)
-
-
-# --- the command ---
-
-
-def test_the_command(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", f"my name={run}", "--html", str(tmp_path / "out")]) == 0
-    assert content((tmp_path / "out" / "index.html").read_text())["runs"][0]["name"] == "my name"
-    assert "2 episodes, 1 with a video" in capsys.readouterr().out
-    assert main(["report", str(tmp_path), "--html", str(tmp_path / "other")]) == 2
-    assert "holds no episode log" in capsys.readouterr().err
-    assert not (tmp_path / "other").exists()

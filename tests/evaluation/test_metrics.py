@@ -135,7 +135,7 @@ def test_sentences_of_one_rollout_are_singular() -> None:
     assert inputs_phrase([one]) == "not recorded"
 
 
-@pytest.mark.parametrize("n", [1, 7, 40, 1500])
+@pytest.mark.parametrize("n", [1, 40])
 def test_wilson_intervals_are_those_of_statsmodels(n: int) -> None:
     from statsmodels.stats.proportion import proportion_confint
 
@@ -225,7 +225,6 @@ def test_logged_classes_win_and_missing_ones_are_derived() -> None:
     base = {"task": "t", "success": False, "checkpoints": [{"operation": "S", "first_step": None}]}
     assert failure_of({**base, "failure": "reference_drift"}) == "reference_drift"
     assert failure_of({**base, "failure": None}) == "storage_failure"
-    assert failure_of(base) == "storage_failure"
     assert failure_of({**base, "success": True, "failure": None}) is None
     with pytest.raises(MemobenchError, match="is a success and has the failure class 'storage_failure'"):
         failure_of({**base, "success": True, "failure": "storage_failure"})

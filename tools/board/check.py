@@ -54,13 +54,13 @@ def read_board(board: Path) -> list[Submission]:
     Raises:
         MemobenchError: one is refused.
     """
-    found: list[Submission] = []
+    accepted: list[Submission] = []
     for folder in sorted(path for path in board.iterdir() if path.is_dir() or path.is_symlink()):
         submission = read_submission(folder)
-        check_submission(submission, found)
-        found.append(submission)
-    check_partners(found)
-    return found
+        check_submission(submission, accepted)
+        accepted.append(submission)
+    check_partners(accepted)
+    return accepted
 
 
 def check_partners(submissions: Sequence[Submission]) -> None:
@@ -79,9 +79,9 @@ def check_partners(submissions: Sequence[Submission]) -> None:
             raise MemobenchError(
                 f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
             )
-        if found := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
+        if unlike := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
             raise MemobenchError(
-                f"{mine} and its partner without a memory, {partner}, differ in {found[0]}; evaluate both with the "
+                f"{mine} and its partner without a memory, {partner}, differ in {unlike[0]}; evaluate both with the "
                 "same settings"
             )
 
@@ -239,9 +239,9 @@ def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mappi
         choice = record.get("choice")
         answered = choice is not None or record.get("answered", False)
         expected |= evidence_line(get_task(record["task"]), choice, answered)
-    found = {key: record[key] for key in CONTROL_FIELDS if key in record}
-    if found != expected:
-        raise MemobenchError(f"{where} has {found}, expected {expected}; submit the log of this control unchanged")
+    logged = {key: record[key] for key in CONTROL_FIELDS if key in record}
+    if logged != expected:
+        raise MemobenchError(f"{where} has {logged}, expected {expected}; submit the log of this control unchanged")
 
 
 def _check_inputs(run: Submitted) -> None:
@@ -270,8 +270,8 @@ def _ignores_objects(kind: str) -> bool:
     import lerobot.policies  # noqa: F401 - registers the types
     from lerobot.configs.policies import PreTrainedConfig
 
-    found = PreTrainedConfig.get_known_choices().get(kind)
-    return found is not None and found.__module__.startswith("lerobot.") and kind not in READ_OBJECTS
+    config = PreTrainedConfig.get_known_choices().get(kind)
+    return config is not None and config.__module__.startswith("lerobot.") and kind not in READ_OBJECTS
 
 
 def _block(value: Any) -> Mapping[str, Any]:

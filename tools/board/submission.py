@@ -82,10 +82,10 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Submitted:
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object; raise for a key given twice, because readers differ in the value that counts."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise MemobenchError(f"card or log has a key twice in {str(found)[:80]}; submit them unchanged")
-    return found
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        raise MemobenchError(f"card or log has a key twice in {str(content)[:80]}; submit them unchanged")
+    return content
 
 
 def _check_entries(folder: Path, folders: Sequence[str]) -> None:
@@ -93,20 +93,20 @@ def _check_entries(folder: Path, folders: Sequence[str]) -> None:
         raise MemobenchError(f"{folder} is not a folder; expected one with {CARD} and {LOG}")
     entries = sorted(folder.iterdir())
     for entry in entries:
-        found = entry.lstat()
+        status = entry.lstat()
         if entry.name not in (*LARGEST, *folders):
             raise MemobenchError(
                 f"{folder} holds {entry.name[:80]!r}; expected {CARD} and {LOG} only, and folders "
                 f"{' and '.join(CONTROLS)} of a row"
             )
         if entry.name in folders:
-            if not stat.S_ISDIR(found.st_mode):
+            if not stat.S_ISDIR(status.st_mode):
                 raise MemobenchError(f"{entry} is a link or a file; expected a folder")
-        elif not stat.S_ISREG(found.st_mode):
+        elif not stat.S_ISREG(status.st_mode):
             raise MemobenchError(f"{entry} is a link or no plain file; expected a file")
-        elif found.st_size > LARGEST[entry.name]:
+        elif status.st_size > LARGEST[entry.name]:
             raise MemobenchError(
-                f"{entry} has {in_words(found.st_size)}; expected at most {in_words(LARGEST[entry.name])}"
+                f"{entry} has {in_words(status.st_size)}; expected at most {in_words(LARGEST[entry.name])}"
             )
     if missing := [name for name in LARGEST if name not in {entry.name for entry in entries}]:
         raise MemobenchError(f"{folder} lacks {' and '.join(missing)}; `memobench submit` writes both")

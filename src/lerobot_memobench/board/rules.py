@@ -35,7 +35,7 @@ MAY_DIFFER = {
 """Settings of the protocol that a submission may choose; all others have their defaults."""
 CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
 REQUIRED = {
-    found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
+    each.name: each.specifier for each in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not each.marker
 }
 """Package -> its versions under which this package runs."""
 
@@ -54,8 +54,8 @@ def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") 
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
     _check_extent(run, names, 1 if part else FEWEST)
     _check_versions(run, names)
-    if found := disagreements(run.card["episodes"], run.records):
-        raise MemobenchError(f"{run.place}: card and log disagree: {found[0]}; submit both unchanged")
+    if unequal := disagreements(run.card["episodes"], run.records):
+        raise MemobenchError(f"{run.place}: card and log disagree: {unequal[0]}; submit both unchanged")
     _check_salt(run)
 
 
@@ -70,8 +70,8 @@ def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool
         mine, other = (each.card[POLICY].get(key) for each in (run, control))
         if mine != other:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
-    if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
-        raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
+    if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
+        raise MemobenchError(f"{run.place} and {control.place} differ in {unlike[0]}; evaluate with the same settings")
 
 
 def _check_settings(run: Evaluation, **control: Any) -> None:
@@ -89,8 +89,8 @@ def _check_settings(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(
             f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
-    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
-        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
+    if unlike := differences(protocol, fixed, ignore=MAY_DIFFER):
+        raise MemobenchError(f"{run.place}: {unlike[0]} on the board; evaluate with the value of the board")
 
 
 def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:

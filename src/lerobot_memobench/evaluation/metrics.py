@@ -58,13 +58,13 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     for record in records:
         grouped.setdefault(record["task"], []).append(record)
     for name, group in grouped.items():
-        for field, found in (
+        for field, values in (
             ("memory_type", {record["memory_type"] for record in group}),
             ("operations", {operations(record) for record in group}),
         ):
-            if len(found) > 1:
+            if len(values) > 1:
                 raise MemobenchError(
-                    f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(found))}); "
+                    f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(values))}); "
                     "report logs of different versions of a task separately"
                 )
         if group[0]["memory_type"] not in GROUPS:
@@ -381,7 +381,7 @@ def failure_counts(records: Iterable[Record]) -> dict[str, int]:
     return {name: counts[name] for name in _ALL if name in always or counts[name]}
 
 
-# --- every figure of a set of rollouts ---
+# --- summary ---
 
 
 MEMORY_TYPE: Final = "memory type"
@@ -391,7 +391,7 @@ SUITE: Final = "suite"
 
 @dataclass(frozen=True)
 class Summary:
-    """All figures of a set of rollouts.
+    """All rates of a set of rollouts.
 
     Attributes:
         tasks: name -> metrics.
@@ -440,7 +440,7 @@ class Summary:
 
 
 def summary_of(records: Iterable[Record]) -> Summary:
-    """Compute every figure of a set of rollouts."""
+    """Compute all rates of a set of rollouts."""
     records = list(records)
     if not records:
         raise MemobenchError("there are no rollouts to report; run an evaluation first")

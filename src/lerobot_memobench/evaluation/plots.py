@@ -155,16 +155,12 @@ class Bar(NamedTuple):
 
 def bars(runs: Sequence[Run]) -> list[Bar]:
     """Return the bars of all rollouts, then of each memory type."""
-    groups: dict[str, dict[str, list[str]]] = {}  # heading -> name of the evaluation -> tasks
-    for run in runs:
-        for task, memory_type in run.summary.memory_type_of.items():
-            for heading in ("all rollouts", memory_type):
-                groups.setdefault(heading, {}).setdefault(run.name, []).append(task)
-    summaries = {run.name: run.summary for run in runs}
+    types = dict.fromkeys(memory_type for run in runs for memory_type in run.summary.memory_type_of.values())
     return [
-        Bar(heading, name if len(runs) > 1 else "", outcomes(summaries[name], tasks))
-        for heading, members in groups.items()
-        for name, tasks in members.items()
+        Bar(heading, run.name if len(runs) > 1 else "", outcomes(run.summary, tasks))
+        for heading in ("all rollouts", *types)
+        for run in runs
+        if (tasks := [task for task, kind in run.summary.memory_type_of.items() if heading in ("all rollouts", kind)])
     ]
 
 

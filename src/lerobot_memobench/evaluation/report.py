@@ -148,7 +148,7 @@ def evidence_values(run: Run) -> dict[str, Any]:
 
 
 def evaluation_data(run: Run) -> dict[str, Any]:
-    """Return the figures of one evaluation: the keys of ``report.json`` and more."""
+    """Return the JSON values of one evaluation: the keys of ``report.json`` and more."""
     summary = run.summary
     policy = run.protocol[POLICY]
     return {

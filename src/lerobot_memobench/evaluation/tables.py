@@ -31,7 +31,7 @@ class Name(str):
 
 
 class Numbers(str):
-    """Figures written out; set flush right like figures."""
+    """Numbers written out; set flush right."""
 
 
 class PrefixRates(NamedTuple):
@@ -110,7 +110,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A report: sections, and the same figures as JSON values."""
+    """A report: sections, and the same values as JSON."""
 
     title: str
     sections: Sequence[Section]
