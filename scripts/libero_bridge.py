@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, has_log, read_log
+from lerobot_memobench.envs.episode_log import MERGED_FILE, has_log, read_lines
+from lerobot_memobench.envs.evaluation_file import FORMAT, write_facts
 from lerobot_memobench.evaluation.statistics import mcnemar
 from lerobot_memobench.policies.remote.transports import Websocket
 from lerobot_memobench.protocol import EVALUATION_SEED, UPSTREAM, UPSTREAM_EVALUATIONS, UPSTREAM_HORIZON
@@ -55,7 +56,9 @@ def tasks_without_scans() -> list[str]:
 def stock(folder: Path, tasks: list[str], episodes: int, server: Websocket, replan: int) -> None:
     """Run the missing episodes of some tasks and append them to the log in ``folder``."""
     prepare()
-    folder.mkdir(parents=True, exist_ok=True)
+    protocol = {"suite": "published", "protocol": UPSTREAM, "seed_base": EVALUATION_SEED, "referent": "fixed"}
+    protocol |= {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON, "replan_steps": replan}
+    write_facts(folder, {"format": FORMAT, "protocol": protocol, "policy": {}})
     done = {(record["task"], record["episode"]) for record in read(folder)}
     for name in tasks:
         for episode in range(episodes):
@@ -94,9 +97,7 @@ def play(task: Task, episode: int, server: Websocket, replan: int) -> Record:
         "memory_type": task.memory_type,
         "episode": episode,
         "seed": seed,
-        "referent": "fixed",
         "variant": 0,
-        "replan_steps": replan,
         "prompt_steps": 0,
         "steps": progress.steps,
         "success": progress.success,
@@ -104,8 +105,6 @@ def play(task: Task, episode: int, server: Websocket, replan: int) -> Record:
             {"operation": checkpoint.operation, "first_step": first, "ordered_step": ordered}
             for checkpoint, first, ordered in steps
         ],
-        "world": "libero",
-        "protocol": UPSTREAM,
         "wall_s": round(time.monotonic() - start, 3),
     }
 
@@ -135,7 +134,7 @@ def request(env: Any, task: Task, observation: dict[str, NDArray[np.float64]], s
 
 def read(folder: Path) -> list[Record]:
     """Return the episodes of a folder's log, [] without a log."""
-    return read_log(folder, []) if has_log(folder) else []
+    return read_lines(folder, []) if has_log(folder) else []
 
 
 def pairs_of(here: Path, there: Path) -> list[Pair]:

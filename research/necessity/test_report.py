@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
 from research.necessity.__main__ import necessity
@@ -15,6 +14,7 @@ from research.necessity.report import _bounds_of, bounds, in_words, verdict
 from research.necessity.settings import settings_of, variants_of
 from research.necessity.trained import read_evaluations, with_evaluations
 from tests.support import logs
+from tests.support.logs import write_log
 
 STOVE, STRICT_TASK = "turn_on_the_stove_and_turn_it_off", "turn_the_stove_on_and_off_a_given_number_of_times"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -60,13 +60,13 @@ def test_rates_of_trained_policies_are_added(tmp_path: Path) -> None:
         logs.record(STRICT_TASK, k, referent="drawn", suite="strict", variant=k % 3, success=k < 2, policy="me")
         for k in range(6)
     ]
-    write_episodes(tmp_path, lines)
+    write_log(tmp_path, lines)
     evaluated = read_evaluations([tmp_path])
     found, published = with_evaluations([result(STRICT_TASK, "drawn", 0.0), result(STOVE, "fixed", None)], evaluated)
     assert found["trained"] == {"policy": "me", "success": 2, "n": 6, "balanced": True}
     assert published["trained"] is None
     assert _bounds_of(found)[-1] == "33.3 [9.7–70.0] of 6"
-    write_episodes(tmp_path / "few", lines[::3])
+    write_log(tmp_path / "few", lines[::3])
     (found,) = with_evaluations([result(STRICT_TASK, "drawn", 0.0)], read_evaluations([tmp_path / "few"]))
     assert _bounds_of(found)[-1].endswith("of 2, variants out of balance")
 

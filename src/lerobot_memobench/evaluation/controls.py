@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, percent
 from lerobot_memobench.evaluation.records import Run
@@ -20,7 +19,7 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
     import yaml
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
-    suite = with_omitted(run.protocol)["suite"]
+    suite = run.protocol["suite"]
     conditions = "; ".join([headline([run]), *([run.missing] if run.missing else [])])
     entries = [
         EvalResultEntry(

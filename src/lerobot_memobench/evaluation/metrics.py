@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from lerobot_memobench.envs.episode_log import seed_base
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
@@ -93,11 +94,6 @@ def policy_inputs(records: Iterable[Record]) -> str:
     return "; ".join(parts) or NOT_RECORDED
 
 
-def seed_base(record: Record) -> int:
-    """Return the seed of episode 0, computed from a rollout's own; a scene may be run with each of its variants."""
-    return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
-
-
 def varies(record: Record) -> bool:
     """Return whether the scene of a rollout is run with several variants."""
     return (record.get("variants") or 1) > 1
@@ -111,9 +107,6 @@ PROTOCOL: dict[str, Callable[[Record], Any]] = {
 }
 """Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
 
-OWNER = ("policy", "run")
-"""Fields of a record that name its policy."""
-
 
 def mixtures(records: Iterable[Record]) -> list[str]:
     """Return a sentence for each part of the protocol in which rollouts differ."""
@@ -124,11 +117,6 @@ def mixtures(records: Iterable[Record]) -> list[str]:
         if len(found) > 1:
             listed = ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
             notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
-    known = [field for field in OWNER if any(record.get(field) for record in records)]
-    unnamed = sum(any(not record.get(field) for field in known) for record in records)
-    if unnamed:
-        of_policy = "names no policy" if unnamed == 1 else "name no policy"
-        notes.append(f"{count_of(unnamed, 'rollout')} of {len(records)} {of_policy}; the figures are over all of them.")
     return notes
 
 

@@ -13,13 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import read_lines, write_episodes
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.evaluation.comparison import Comparison, comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.controls import granularity_data, granularity_section
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import Rate, Row, percent, report_values
-from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, read_run, sweeps, unlike
 from lerobot_memobench.evaluation.report_tables import (
     best_interval,
     failures_table,
@@ -54,10 +55,9 @@ def write_report(directory: str | Path) -> Run:
     Raises:
         MemobenchError: see `read_run`.
     """
-    directory, notes = Path(directory), list[str]()
-    lines = read_log(directory, notes)
-    run = run_of(directory, lines, notes)
-    write_episodes(directory, lines)
+    directory = Path(directory)
+    run = read_run(directory)
+    write_episodes(directory, read_lines(directory, []))
     figures = {**report_values(run.summary), **evidence_values(run)}
     if run.not_run:
         figures["not_run"] = run.not_run
