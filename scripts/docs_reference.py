@@ -316,12 +316,13 @@ def schemas_page() -> str:
         ("Policy of a card", evaluation_file.Policy),
         ("Checkpoint of a card", evaluation_file.Checkpoint),
         ("One start", evaluation_file.Start),
-        ("Episodes of a card", evaluation_file.CardEpisode),
+        ("Settings of a card", evaluation_file.CardSettings),
     ]
     parts = [
         "# Log and card schemas",
-        "Files are validated against these types when they are read. Unknown fields are allowed. `null` is allowed if "
-        "the type includes `None`.",
+        "Files are validated against these types when they are read. `null` is allowed if the type includes `None`. "
+        "A line holds an outcome; settings, inputs and policy are in `evaluation.json` and apply to each line. Lines "
+        "with other fields are skipped, and files of another `format` are refused.",
     ]
     for heading, kind in wanted:
         summary = plain((kind.__doc__ or "").partition("\n\n")[0])

@@ -102,9 +102,9 @@ def test_tables_with_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.syspath_prepend(EXAMPLE)
     example = runpy.run_path(str(EXAMPLE / "tables.py"))
     (run,) = read_runs([logs.evaluation(tmp_path / "a")])
-    changed = replace(run, protocol={**run.protocol, "horizon": 600, "world": "memobench", "suite": "strict"})
+    changed = replace(run, protocol={**run.protocol, "horizon": 600, "suite": "strict"})
     assert example["departures"](changed)[len(example["departures"](run)) :] == [
-        *("suite strict, not published", "world memobench, not libero", "horizon 600, not 1200"),
+        *("suite strict, not published", "horizon 600, not 1200"),
     ]
     report = example["paper_report"]([run])
     text = WRITERS["markdown"](report)

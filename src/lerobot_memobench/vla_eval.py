@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.env import MemobenchEnv
-from lerobot_memobench.envs.episode_log import Acting
-from lerobot_memobench.envs.evaluation_file import check_protocol
+from lerobot_memobench.envs.evaluation_file import Acting, check_facts, facts_of
 from lerobot_memobench.envs.lerobot import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
@@ -140,7 +139,7 @@ class MEMOBench(StepBenchmark):
         policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
         self._acting = Acting(policy, PIXEL_INPUT)
         if log_dir is not None:  # fail before the first episode
-            check_protocol(Path(log_dir), self._settings.protocol_block | self._acting.protocol)
+            check_facts(Path(log_dir), facts_of(self._settings, self._acting))
         self._env: MemobenchEnv | None = None
         self._history: dict[str, list[NDArray[Any]]] = {}
 

@@ -21,7 +21,7 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID
-from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -108,7 +108,7 @@ def test_help_explains_every_short_form(
 
 
 def test_an_evaluation_writes_and_prints_its_report(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
-    surplus = logs.record(STOVE, 3, seed=10, replan_steps=None)
+    surplus = line_of(logs.record(STOVE, 3))
     fake_loop.before = lambda plan: EpisodeLog(plan.log).append(surplus)  # as plain lerobot-eval does
     assert main(["eval", "env=memobench", f"tasks={STOVE}", "episodes=2", "output_dir=out"]) == 0
     average = json.loads(Path("out/report.json").read_text())["average"]
@@ -137,7 +137,7 @@ def test_errors_in_a_run(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
     def fail(plan: EvaluationPlan) -> None:
         (plan.output / "videos").mkdir(parents=True)
         if finished:
-            EpisodeLog(plan.log).append(logs.record(STOVE))
+            EpisodeLog(plan.log).append(line_of(logs.record(STOVE)))
         try:
             raise MemobenchError("the scene\nis wrong")
         except MemobenchError as error:

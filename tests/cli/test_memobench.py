@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.cli.memobench import COMMANDS, main
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from tests.support.logs import write_log
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -165,7 +165,7 @@ def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
         }
         for k in range(4)
     ]
-    write_episodes(folder, records)
+    write_log(folder, records)
     return str(folder)
 
 

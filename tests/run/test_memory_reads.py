@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.env import MemobenchEnv
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.settings import OBJECTS, RESET, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import page_data, write_html
@@ -27,7 +26,7 @@ from lerobot_memobench.policies.memory_reads import (
 )
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import merge
-from tests.support.logs import record
+from tests.support.logs import record, write_log
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 MILK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -180,7 +179,7 @@ def test_a_damaged_file_is_left_out_with_a_note(tmp_path: Path, content: bytes) 
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()
     path.write_bytes(content)
-    write_episodes(tmp_path, [ROLLOUT])
+    write_log(tmp_path, [ROLLOUT])
     written = write_html([tmp_path], tmp_path / "html")
     assert len(written.notes) == 1
     assert str(path) in written.notes[0]

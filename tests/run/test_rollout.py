@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode
-from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, read_episodes
-from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, read_evaluation
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError

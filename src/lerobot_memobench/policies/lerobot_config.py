@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import hashlib
 import json
 import logging
-import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import Acting
+from lerobot_memobench.envs.evaluation_file import Acting
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
@@ -98,16 +96,22 @@ def check_device(device: str | None) -> None:
 # --- identity ---
 
 
-def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the episode log; ``seeds``: of the requested episodes, see `Acting`."""
-    run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
+def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
+    """Return the description of a policy for the evaluation's file.
+
+    Args:
+        policy: its configuration.
+        path: its checkpoint; None for a policy without one.
+        settings: settings of its environments.
+    """
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
-    return Acting(_identity(policy, path), inputs, run, seeds)
-
-
-def _identity(policy: Any, path: str | None) -> dict[str, Any]:
-    """Return a policy's type and one hash over its checkpoint and the settings that differ from it."""
     weights = None if path is None else checkpoint_hash(path)
+    hashed = {"sha256": weights} if path is not None and Path(path).is_dir() else {}
+    return Acting({"type": policy.type, "identity": identity_of(policy, path, weights), **hashed}, inputs)
+
+
+def identity_of(policy: Any, path: str | None, weights: str | None) -> str:
+    """Return a policy's type and one hash over its checkpoint's hash and the settings that differ from it."""
     with quiet():
         before = encoded(_default_config(policy, path))
     changes = {
@@ -116,8 +120,7 @@ def _identity(policy: Any, path: str | None) -> dict[str, Any]:
         if key not in (*ELSEWHERE, "type") and before.get(key) != value
     }
     facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)
-    identity = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
-    return identity | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
+    return f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"
 
 
 def _default_config(policy: Any, path: str | None) -> Any:

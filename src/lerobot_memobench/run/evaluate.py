@@ -16,10 +16,11 @@ from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.evaluation_file import INPUTS, POLICY, Acting, read_evaluation
 from lerobot_memobench.envs.lerobot import Opener
 from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.policies.lerobot_config import acting, quiet
+from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.policies.memory_reads import noting_reads
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
@@ -33,7 +34,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
 
     Args:
         cells: the batches, those of one task in succession.
-        begin: called once, after the policy is loaded and before the first scene.
+        begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
 
     Raises:
         MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
@@ -50,7 +51,8 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     rests = plan.environment.corrupt != SWAP
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
     asked = range(plan.seed, plan.seed + plan.grid.runs)
-    by = acting(policy, plan.policy_path, asked, environment.settings)
+    facts = read_evaluation(plan.log)
+    by = Acting(facts[POLICY], facts["protocol"][INPUTS], asked)
     # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
     opened = environment.opener(actor.policy.config, by, plan.log)
     environments = Environments(opened, plan.settings.use_async_envs is not False)

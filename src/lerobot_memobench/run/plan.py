@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
+from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -375,8 +375,8 @@ def with_salt(asked: EvaluationSettings, options: RunOptions, log: Path) -> Eval
         return asked
     if options.resume:
         for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
-            if protocol := protocol_of(folder):
-                return asked.env_default(salt=protocol.get("salt"))
+            if has_evaluation(folder):
+                return asked.env_default(salt=read_evaluation(folder)["protocol"].get("salt"))
     if options.shard is not None:
         raise MemobenchError(
             f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
@@ -416,9 +416,8 @@ def with_batch_size(
 
 def earlier_batch_size(log: Path) -> int | None:
     """Return the batch size of the evaluation in a folder, None where it is not known."""
-    starts = read_evaluation(log).get("runs") or [{}]
-    size = starts[-1].get("batch_size")
-    return None if size is None else int(size)
+    starts = read_evaluation(log).get("runs") if has_evaluation(log) else None
+    return int(starts[-1]["batch_size"]) if starts else None
 
 
 # --- how it is run: resume=, shard=, shards=, workers= … ---
