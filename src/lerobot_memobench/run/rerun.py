@@ -23,7 +23,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot_memobench.envs.episode_log import key_of, read_log
 from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import EnvSettings, revision
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
@@ -42,8 +42,6 @@ from lerobot_memobench.run.command_line import (
 )
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
-from lerobot_memobench.tasks.difficulty import STANDARD
-from lerobot_memobench.tasks.task import PUBLISHED
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
@@ -78,19 +76,24 @@ def repeat(
         MemobenchError: the card cannot be repeated here.
     """
     card = repeatable_card(path, server)
-    check_version(card)
     check_policy(card)
     for note in differences_here(card):
         say(f"note: {note}")
-    plan, episodes = plan_of_card(card, out), read_log(path if path.is_dir() else path.parent)
+    plan = plan_of_card(card, out)
+    here = plan.environment.settings.protocol_block
+    if found := differences(card["protocol"], here):
+        start = card["runs"][-1]
+        raise MemobenchError(
+            f"another version ran the card ({'; '.join(found)}, there and here); repeat it with that version "
+            f"({start['versions'].get(PACKAGES[0], 'not known')}, commit {start['git_commit'] or 'not known'})"
+        )
+    episodes = read_log(path if path.is_dir() else path.parent)
     check_extent(card, episodes, plan)
-    if status := evaluate(plan):
-        return status
-    here = read_evaluation(plan.log)["protocol"]
     for note in (hashed := other_hashes(card["protocol"], here)):
         say(f"note: {note}")
-    problems = differences(card["protocol"], here)
-    problems += disagreements(episodes, read_log(plan.log), "there", "here", [SCENES] if hashed else [])
+    if status := evaluate(plan):
+        return status
+    problems = disagreements(episodes, read_log(plan.log), "there", "here", [SCENES] if hashed else [])
     if not problems:
         say(f"repeated: {count_of(len(episodes), 'episode')}, as in the log")
         return 0
@@ -151,22 +154,6 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
             f"the {problem} {task}, episode {episode}; expected the outcome of each of the "
             f"{count_of(len(wanted), 'episode')} of the card's protocol, as of a finished evaluation"
         )
-
-
-def check_version(card: Mapping[str, Any]) -> None:
-    """Refuse a card of a version with other goals or holds of strict tasks.
-
-    Raises:
-        MemobenchError: it names that version.
-    """
-    run, protocol = card["runs"][-1], card["protocol"]
-    version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
-    for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
-        if (there := protocol.get(name)) != here:
-            raise MemobenchError(
-                f"another version ran the card ({name}={there} on the card, {name}={here} here); repeat it with that "
-                f"version ({version})"
-            )
 
 
 def check_policy(card: Mapping[str, Any]) -> None:
