@@ -78,8 +78,8 @@ class Bench:
 
     def rerun(self) -> None:
         """All that `memobench rerun` does with a card before and after the run."""
-        card = again.repeatable_card(self.run)
-        again.check_policy(card)
+        card, settings = again.read_repeatable(self.run)
+        again.check_policy(card, settings.policy_path)
         again.differences_here(card)
 
     def use(self, rng: random.Random) -> object:

@@ -64,7 +64,7 @@ def run_evaluation(
     """
     if plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
-    with held(plan):
+    with locked_evaluation(plan):
         card = card_of(plan)
         if plan.options.resume:
             card = resumed_card(plan.log, card, note)
@@ -133,9 +133,8 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     # Logged rows of a resumed batch rest, and have no memory to swap.
     rests = plan.environment.corrupt != SWAP
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
-    asked = range(plan.seed, plan.seed + plan.grid.runs)
     facts = read_evaluation(plan.log)
-    by = Acting(facts[POLICY], facts["protocol"][INPUTS], asked)
+    by = Acting(facts[POLICY], facts["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
     # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
     opened = environment.opener(actor.policy.config, by, plan.log)
     environments = Environments(opened, plan.settings.use_async_envs is not False)
@@ -273,8 +272,8 @@ def check_folder(folder: Path) -> None:
 
 
 @contextmanager
-def held(plan: EvaluationPlan) -> Iterator[None]:
-    """Make and lock the folders of an evaluation and of its log, see `made`.
+def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
+    """Make and lock the folders of an evaluation and of its log, see `locked_folder`.
 
     Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file.
 
@@ -283,7 +282,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
-            stack.enter_context(made(folder))
+            stack.enter_context(locked_folder(folder))
         refuse_links(plan.log / VIDEOS, plan.log / MEMORY_READS)
         for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
             remove_drafts(folder)
@@ -297,7 +296,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Make a folder and lock it while it is written to; afterwards new folders that are empty are removed.
 
     Raises:
