@@ -274,7 +274,7 @@ def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
 def test_rows_of_evidence_are_recomputed(tmp_path: Path) -> None:
     """One scene of two variants, of which both were answered by the first."""
     task = "put_the_butter_into_the_bowl_from_the_prompt_video"
-    asked = [{"episode": k, "variant": k, "variants": 2, "choice": 0, "chance": 0.5} for k in (0, 1)]
+    asked = [{"episode": k, "seed": 7, "variant": k, "variants": 2, "choice": 0, "chance": 0.5} for k in (0, 1)]
     lines = [rollout(task, "object", "S", [True], one["choice"] == one["variant"], 7) | one for one in asked]
     keep_one(tmp_path, lines)
     page, log = tmp_path / "page.md", ONE
@@ -487,7 +487,7 @@ def test_all_fields_of_log_and_card_have_a_meaning() -> None:
         episode_log.CheckpointRecord,
         evaluation_file.Protocol,
         evaluation_file.Card,
-        evaluation_file.CardEpisode,
+        evaluation_file.CardSettings,
     ):
         assert all(meaning for _, meaning, _ in reference.typed_rows(kind)), kind
     rows = reference.typed_rows(episode_log.EpisodeRecord)

@@ -191,7 +191,6 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"history_every": 0}, "history_every"),
         ({"seed": 100_007}, "test-sealed"),
         ({"obs_type": "both"}, "send_state"),
-        ({"mirror": True}, "'mirror'"),
         ({"evidence": True}, "referent"),
         ({"suite": "strict"}, "set replan_steps"),
         ({"n_action_steps": 4, "replan_steps": 6}, "multiple of n_action_steps=4"),

@@ -18,7 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import disagreement
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.run.card import extended, joined_runs, policy_facts, run_facts, training_facts, with_checkpoint
-from lerobot_memobench.run.run import resumed_card
+from lerobot_memobench.run.evaluate import resumed_card
 from lerobot_memobench.run.shards import merge
 from tests.support import logs
 

@@ -214,7 +214,7 @@ def test_a_full_disk_is_named_with_folder_and_command(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write raises it, without a path
 
     with monkeypatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.run.write_report", full)
+        patch.setattr("lerobot_memobench.run.evaluate.write_report", full)
         assert evaluate("output_dir=out") == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert "out cannot be written (No space left on device; " in last

@@ -98,7 +98,7 @@ def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
     monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
     fake = FakeLoop()
-    monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)
+    monkeypatch.setattr("lerobot_memobench.run.evaluate.evaluate", fake)
     return fake
 
 

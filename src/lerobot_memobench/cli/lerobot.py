@@ -195,7 +195,7 @@ def flags_of_other(words: Mapping[str, str]) -> list[str]:
 
 def evaluate_here(plan: EvaluationPlan) -> int:
     """Run an evaluation, or a part of one, and print its report."""
-    from lerobot_memobench.run.run import run_evaluation
+    from lerobot_memobench.run.evaluate import run_evaluation
 
     with counting(console(), "episodes") as count:
         report = run_evaluation(plan, note, say, count)

@@ -118,10 +118,11 @@ class Actor:
 
     def act(self, inputs: dict[str, Any]) -> NDArray[np.float32]:
         """Return the environment's actions (B, A)."""
-        policys, environments = self.after
-        action = environments({ACTION: policys(self.actions.select(inputs))})[ACTION]
-        found: NDArray[np.float32] = action.to("cpu").numpy()
-        return found
+        policy_post, env_post = self.after
+        actions: NDArray[np.float32] = (
+            env_post({ACTION: policy_post(self.actions.select(inputs))})[ACTION].cpu().numpy()
+        )
+        return actions
 
 
 def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None, corrupt: str = INTACT) -> None:
