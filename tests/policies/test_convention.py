@@ -172,7 +172,7 @@ def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
     path = saved(tmp_path, NUMBERED, rename_map=RENAMED_LIBERO)
     line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"]
     plan = plan_line([*line, f"camera_name_mapping={json.dumps(names)}"])
-    assert plan.settings.portable["env"]["camera_name_mapping"] == names
+    assert plan.environment.camera_name_mapping == names
     assert plan.environment.features_map["pixels/camera2"] == "observation.images.camera2"
     unclear = saved(tmp_path / "unclear", NUMBERED)
     mapping = f"camera_name_mapping={json.dumps(names)}"

@@ -246,10 +246,11 @@ def check_with_lerobot(config: TrainPipelineConfig, asked: CommandSettings) -> N
         MemobenchError: LeRobot refuses it, or the folder of a new training exists.
     """
     if not config.resume and config.output_dir is not None and config.output_dir.is_dir():
-        raise MemobenchError(
-            f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training with "
-            "resume=true"
-        )
+        with locked_run(asked.get("output_dir")):  # a training that is running there is the better reason
+            raise MemobenchError(
+                f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training "
+                "with resume=true"
+            )
     given = {CONFIG_FILE: asked.config_path, "output_dir": asked.words.get("output_dir")} if config.resume else {}
     line, sys.argv = sys.argv, [sys.argv[0], *(f"--{key}={value}" for key, value in given.items() if value is not None)]
     try:
