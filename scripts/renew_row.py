@@ -17,7 +17,7 @@ import lerobot_policy_memobench  # noqa: F401 - registers policies
 from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, About, write_submission
 from lerobot_memobench.cli.lerobot import evaluate_here
 from lerobot_memobench.envs.evaluation_file import read_evaluation
-from lerobot_memobench.run.rerun import plan_of, read_repeatable
+from lerobot_memobench.rollouts.rerun import plan_of, read_repeatable
 
 
 def renew(row: Path, out: Path) -> int:

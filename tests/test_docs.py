@@ -25,11 +25,7 @@ from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
-from lerobot_memobench.envs import episode_log, evaluation_file
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Rate
-from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     HELP,
     is_of_benchmark,
     parse_words,
@@ -38,8 +34,12 @@ from lerobot_memobench.run.command_line import (
     spelled,
     typed,
 )
-from lerobot_memobench.run.plan import take_run_options
-from lerobot_memobench.run.settings import read_settings
+from lerobot_memobench.envs import episode_log, evaluation_file
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.policies.memobench_mem.memory import OURS
+from lerobot_memobench.rollouts.plan import take_run_options
+from lerobot_memobench.rollouts.settings import read_settings
 from lerobot_memobench.training.command import take_training_options
 from research import kept
 from tests.support.logs import rollout, write_log

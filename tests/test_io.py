@@ -87,7 +87,7 @@ def test_files_below_reads_every_tree() -> None:
     }
     assert used == {
         "io.py",
-        "run/evaluate.py",
+        "rollouts/evaluate.py",
         "training/command.py",
     }  # the last two name one file
 

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
@@ -24,6 +23,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS

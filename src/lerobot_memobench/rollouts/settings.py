@@ -11,11 +11,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-from lerobot_memobench.envs.settings import SETTINGS, EnvSettings
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import portable_path
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     TYPE,
     build,
     chosen_class,
@@ -24,6 +20,10 @@ from lerobot_memobench.run.command_line import (
     read_words,
     value_of,
 )
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
+from lerobot_memobench.envs.settings import SETTINGS, EnvSettings
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.checkpoint import portable_path
 from lerobot_memobench.tasks.catalogue import lerobots_choice
 from lerobot_memobench.tasks.task import PUBLISHED
 

@@ -20,8 +20,8 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.envs.settings import INTACT
-from lerobot_memobench.protocol import CLOCK
 
 PIXELS, PHASE, STEP = "pixels", "phase", "step"
 """Keys of the environment's observations; ``phase`` is 0 in the demonstration prompt and 1 in the execution."""

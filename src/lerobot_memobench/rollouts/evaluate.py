@@ -36,9 +36,9 @@ from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.lerobot_config import quiet
 from lerobot_memobench.policies.memory_reads import MEMORY_READS, noting_reads
-from lerobot_memobench.run.card import card_of, extended, with_checkpoint
-from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask, Shard
-from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
+from lerobot_memobench.rollouts.card import card_of, extended, with_checkpoint
+from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, PlannedTask, Shard
+from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, roll
 
 VIDEOS = "videos"
 """Folder of the videos, in that of the log."""

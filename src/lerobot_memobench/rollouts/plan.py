@@ -15,15 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
-from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
-from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
-from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
-from lerobot_memobench.policies.compatibility import check_features, chosen_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
-from lerobot_memobench.protocol import (
+from lerobot_memobench.commands.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
+from lerobot_memobench.constants import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
     EVIDENCE_EPISODES,
@@ -32,7 +25,14 @@ from lerobot_memobench.protocol import (
     SPLITS,
     VALIDATION,
 )
-from lerobot_memobench.run.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
+from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
+from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
+from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
+from lerobot_memobench.policies.compatibility import check_features, chosen_convention
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.libero_suites import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-    from lerobot_memobench.run.settings import EvaluationSettings
+    from lerobot_memobench.rollouts.settings import EvaluationSettings
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
 """Policies whose actions the environment offers -> the setting by which it does."""
@@ -97,7 +97,7 @@ class EvaluationPlan:
 
     @property
     def split(self) -> str | None:
-        """The split of `protocol.SPLITS` that holds the seeds of all its scenes, None without one."""
+        """The split of `constants.SPLITS` that holds the seeds of all its scenes, None without one."""
         seeds = self.seeds
         return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
 
@@ -141,7 +141,7 @@ def plan_line(line: Sequence[str]) -> EvaluationPlan:
 
 def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation for the words of a command line."""
-    from lerobot_memobench.run.settings import read_settings
+    from lerobot_memobench.rollouts.settings import read_settings
 
     options, others = take_run_options(words)
     return make_plan(read_settings(others), options, ("lerobot", "eval", *spelled(words)))
@@ -154,7 +154,7 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
         MemobenchError: it cannot be run.
     """
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-    from lerobot_memobench.run.settings import policy_of, with_policy
+    from lerobot_memobench.rollouts.settings import policy_of, with_policy
     from lerobot_memobench.sim.files import check_assets
 
     if options.resume and settings.output_dir is None:

@@ -20,17 +20,17 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
-from lerobot_memobench.run import rerun
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.rerun import (
+from lerobot_memobench.rollouts import rerun
+from lerobot_memobench.rollouts.card import card_of
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
     differences_here,
     plan_of,
     read_repeatable,
 )
-from lerobot_memobench.run.settings import EvaluationSettings, settings_of
+from lerobot_memobench.rollouts.settings import EvaluationSettings, settings_of
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
@@ -43,7 +43,7 @@ RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "su
 def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An empty folder, and no search of all installed packages."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
+        patch.setattr("lerobot_memobench.commands.command_line.register_plugins", lambda: None)
         patch.chdir(tmp_path_factory.mktemp("here"))
         make_checkpoint(Path("checkpoint"))
         yield
@@ -124,7 +124,7 @@ def test_hostile_settings_are_refused_by_name(named: str, changes: dict[str, Any
 
 def test_the_device_of_a_card_may_be_missing_here(monkeypatch: pytest.MonkeyPatch) -> None:
     for there in (True, False):
-        monkeypatch.setattr("lerobot_memobench.run.rerun.has_device", lambda device, there=there: there)
+        monkeypatch.setattr("lerobot_memobench.rollouts.rerun.has_device", lambda device, there=there: there)
         asked = allowed(env={"tasks": STOVE}, policy={"type": "memobench_random", "device": "cuda"})
         assert ("device" in asked.policy) == there
 

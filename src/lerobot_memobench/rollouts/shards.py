@@ -33,8 +33,8 @@ from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import card_of, extended
-from lerobot_memobench.run.evaluate import (
+from lerobot_memobench.rollouts.card import card_of, extended
+from lerobot_memobench.rollouts.evaluate import (
     VIDEOS,
     Note,
     check_folder,
@@ -43,7 +43,7 @@ from lerobot_memobench.run.evaluate import (
     logged,
     resumed_card,
 )
-from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
+from lerobot_memobench.rollouts.plan import EvaluationPlan, Shard, with_changes
 
 LOGS = "logs"
 

@@ -12,17 +12,17 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.envs.episode import Episode, generator, referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.rerun import plan_of
-from lerobot_memobench.run.settings import settings_of
-from lerobot_memobench.run.shards import plan_shards
+from lerobot_memobench.rollouts.card import card_of
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.rerun import plan_of
+from lerobot_memobench.rollouts.settings import settings_of
+from lerobot_memobench.rollouts.shards import plan_shards
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.fake_loop import STOVE, FakeLoop
 

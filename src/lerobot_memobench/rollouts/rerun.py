@@ -20,6 +20,16 @@ from typing import Any
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_memobench.commands.command_line import (
+    NULLS,
+    PLAIN,
+    chosen_class,
+    field_types,
+    load_plugins,
+    value_of,
+    without_none,
+)
+from lerobot_memobench.constants import HORIZON, SEALED
 from lerobot_memobench.envs.episode_log import key_of, read_log
 from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
 from lerobot_memobench.envs.pacing import longest
@@ -29,19 +39,9 @@ from lerobot_memobench.evaluation.records import SCENES, disagreements, other_ha
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
-from lerobot_memobench.protocol import HORIZON, SEALED
-from lerobot_memobench.run.card import PACKAGES, detector_hash, versions
-from lerobot_memobench.run.command_line import (
-    NULLS,
-    PLAIN,
-    chosen_class,
-    field_types,
-    load_plugins,
-    value_of,
-    without_none,
-)
-from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
+from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
+from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
+from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
