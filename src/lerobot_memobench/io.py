@@ -318,6 +318,7 @@ EXPECTED = {
     "less_than_equal": "at most {le}",
     "too_short": "{min_length} entries at least",
     "too_long": "{max_length} entries at most",
+    "extra_forbidden": "no such field",
 }
 """pydantic's name of an error -> expected value."""
 

@@ -14,7 +14,6 @@ from lerobot_memobench.envs.evaluation_file import (
     differences,
     differences_of_parts,
     write_evaluation,
-    write_facts,
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
@@ -39,7 +38,7 @@ def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, 
 
 def test_file_is_written_with_the_first_episode(tmp_path: Path) -> None:
     def log(**changes: Any) -> EpisodeLog:
-        return EpisodeLog(tmp_path, lambda: write_facts(tmp_path, facts({**SETTINGS, **changes})))
+        return EpisodeLog(tmp_path, facts({**SETTINGS, **changes}))
 
     first = log()
     assert not list(tmp_path.iterdir())

@@ -52,7 +52,7 @@ def record(task: str, memory_type: str, episode: int, success: bool, **changes: 
 
 
 def test_files_next_to_the_log(tmp_path: Path) -> None:
-    log = EpisodeLog(tmp_path, lambda: write_evaluation(tmp_path, logs.facts()))
+    log = EpisodeLog(tmp_path, logs.facts())
     for k in range(4):
         log.append(line_of(record("first", "temporal", k, k != 0)))
         log.append(line_of(record("second", "procedural", k, True)))

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from lerobot_memobench.constants import (
     SPLITS,
     UNSEEDED,
 )
+from lerobot_memobench.envs.env import Interference
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
     EpisodeLog,
@@ -32,7 +33,7 @@ from lerobot_memobench.envs.episode_log import (
     not_run_record,
     read_lines,
 )
-from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, facts_of, write_facts
+from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, facts_of
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -121,9 +122,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.action_space = action_space()
         self._acting = acting
         self._log_dir = Path(log_dir) if log_dir is not None else None
-        self._log: EpisodeLog | None = None
-        if self._log_dir is not None:
-            self._log = EpisodeLog(self._log_dir, partial(write_facts, self._log_dir, facts_of(settings, acting)))
+        self._log = None if log_dir is None else EpisodeLog(log_dir, facts_of(settings, acting))
         self._video: VideoRecorder | None = None
         self._observer = Observer(settings)
         self._others: Interference | None = None

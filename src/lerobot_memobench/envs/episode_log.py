@@ -12,11 +12,11 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
 
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLICY, read_evaluation
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLICY, read_evaluation, write_facts
 from lerobot_memobench.envs.settings import INTACT, steps_per_action
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
@@ -208,12 +208,12 @@ class EpisodeLog:
     """Append finished rollouts of this process to ``directory``, which is created when the first rollout ends.
 
     Args:
-        begin: called once before the first line is written; may raise.
+        facts: content of the evaluation's file, which is written before the first line; None if it is there.
     """
 
-    def __init__(self, directory: str | Path, begin: Callable[[], object] | None = None) -> None:
+    def __init__(self, directory: str | Path, facts: Mapping[str, Any] | None = None) -> None:
         self.directory = Path(directory)
-        self._begin = begin
+        self._facts = facts
 
     def append(self, record: Mapping[str, Any]) -> Path:
         """Write one rollout durably and return its file.
@@ -235,9 +235,9 @@ class EpisodeLog:
             ) from error
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if self._begin is not None:
-                self._begin()
-                self._begin = None
+            if self._facts is not None:
+                write_facts(self.directory, self._facts)
+                self._facts = None
             with path.open("ab+") as file:
                 if _ends_torn(file):  # left by a killed process with the same id
                     line = b"\n" + line
