@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import mujoco
@@ -26,7 +26,7 @@ from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.progress import AS_BEGUN
 from lerobot_memobench.tasks.task import STRICT, Task
 from tests.sim.conftest import BOWLS, DRAWER
-from tests.support.scripts import load_script
+from tests.support.libero import simulate
 
 DEEPEST, MOVED = 0.002, 0.005
 """Largest contact depth at rest, and largest displacement while settling, m."""
@@ -109,6 +109,16 @@ LISTED = {
 SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
 
 
+def unsettled(name: str, seeds: Iterable[int]) -> list[int]:
+    """Return the seeds of a task whose scenes do not settle."""
+    sim, found = simulate(name), []
+    for seed in seeds:
+        sim.reset(seed)
+        if not sim.settled:
+            found.append(seed)
+    return found
+
+
 def test_list_is_of_published_tasks_and_the_papers_seeds() -> None:
     assert {*LISTED} < {*task_names(suite="published")}
     assert sum(map(len, LISTED.values())) == 72
@@ -119,7 +129,7 @@ def test_list_is_of_published_tasks_and_the_papers_seeds() -> None:
 @pytest.mark.parametrize("name", [SWAP, "put_the_milk_picked_up_in_the_prompt_video_on_the_plate"])
 def test_listed_scenes_are_those_that_do_not_settle(name: str) -> None:
     seeds = [7, 8, 22, 28, 29]
-    assert load_script("unsettled_scenes").unsettled(name, seeds) == [s for s in seeds if s in LISTED.get(name, [])]
+    assert unsettled(name, seeds) == [s for s in seeds if s in LISTED.get(name, [])]
 
 
 @pytest.mark.slow
@@ -127,7 +137,7 @@ def test_listed_scenes_are_those_that_do_not_settle(name: str) -> None:
 @pytest.mark.parametrize("name", task_names(suite=None))
 def test_all_listed_scenes(name: str) -> None:
     """Of strict tasks there are none: such scenes are drawn again."""
-    assert load_script("unsettled_scenes").unsettled(name, SPLITS[PAPER]) == LISTED.get(name, [])
+    assert unsettled(name, SPLITS[PAPER]) == LISTED.get(name, [])
 
 
 def test_report_counts_them() -> None:

