@@ -21,7 +21,6 @@ from lerobot_memobench.tasks.formula import Atom
 
 ONE = "find_the_tomato_hidden_in_one_of_the_drawers"
 TWO = "find_the_broccoli_or_the_bean_curd_hidden_in_two_of_the_drawers"
-DRAWERS = [f"wooden_cabinet_1_{name}_region" for name in ("top", "middle", "bottom")]
 
 
 def _begun(task: str, seed: int, variant: int) -> Episode:
