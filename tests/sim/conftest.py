@@ -16,20 +16,14 @@ from lerobot_memobench.tasks.catalogue import get_task
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "put_the_tomato_into_the_top_drawer_of_the_cabinet"
 BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
-ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
-
-
-def arm_spec() -> mujoco.MjSpec:
-    """Return the arm alone as a specification."""
-    spec = mujoco.MjSpec.from_string(robot.robot_xml())
-    robot.hide_helpers(spec)
-    return spec
 
 
 @pytest.fixture(scope="session")
 def arm_model() -> mujoco.MjModel:
     """The arm alone."""
-    return arm_spec().compile()
+    spec = mujoco.MjSpec.from_string(robot.robot_xml())
+    robot.hide_helpers(spec)
+    return spec.compile()
 
 
 @pytest.fixture

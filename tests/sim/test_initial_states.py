@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import mujoco
@@ -109,7 +109,7 @@ LISTED = {
 SWAP = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_in_the_prompt"
 
 
-def unsettled(name: str, seeds: range | list[int]) -> list[int]:
+def unsettled(name: str, seeds: Iterable[int]) -> list[int]:
     """Return the seeds of a task whose scenes do not settle."""
     sim, found = simulate(name), []
     for seed in seeds:

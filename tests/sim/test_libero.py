@@ -1,7 +1,7 @@
 """Scenes equal stock LIBERO in models, resets, predicates, rollouts and observations, and MuJoCo's renderer in images.
 
-The records are of MuJoCo 3.3.7, see `tests/support/libero.py`. In other versions objects settle some 10⁻⁵ m elsewhere,
-and touched objects then move differently; `results/scenes.md` has the outcome of 3.3.7.
+The records are of MuJoCo 3.3.7, those of LIBERO's suites of hf-libero 0.1.4. In other versions objects settle some
+10⁻⁵ m elsewhere, and touched objects then move differently; `results/scenes.md` has the outcome of 3.3.7.
 """
 
 from __future__ import annotations
@@ -36,11 +36,8 @@ from tests.support.libero import (
     whole_model,
 )
 
-SEEDS = range(7, 57)
-GRAIN = 1e-11
-"""Resolution of recorded poses, m."""
-STRIDE = 10
-"""Control steps between the recorded states of a rollout."""
+GRAIN, STRIDE = 1e-11, 10
+"""Resolution of recorded poses, m, and control steps between the recorded states of a rollout."""
 EQUAL = 1e-9
 """Tolerance of poses, m, and of sums over a field as a share of its magnitude: MuJoCo's versions round differently."""
 RECORDED = mujoco.__version__ == "3.3.7"
@@ -72,8 +69,13 @@ def slow_but(names: list[str], quick: Any) -> list[Any]:
     return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
+def tasks_of(kind: str) -> list[str]:
+    """Return the tasks of a record."""
+    return sorted({key.partition(":")[0] for key in record(kind)})
+
+
 MEMORY = some_of_all(task_names())
-SUITES = slow_but(sorted({key.partition(":")[0] for key in record("suites")}), ONE_OF_EACH_ARENA.values())
+SUITES = slow_but(tasks_of("suites"), ONE_OF_EACH_ARENA.values())
 
 
 def start(name: str, seed: int = 7, state: int = 0) -> Simulation:
@@ -122,9 +124,8 @@ def test_records_cover_all_tasks_predicates_and_arenas() -> None:
 @pytest.mark.parametrize("name", MEMORY)
 def test_scenes_of_evaluation_seeds(name: str) -> None:
     sim, kept = simulate(name), record("scenes")
-    for seed in range(7, 57):
+    for k, seed in enumerate(range(7, 57)):
         sim._placer.place(seed)
-        k = SEEDS.index(seed)
         fixtures = np.array(list(sim.fixture_poses().values())).reshape(-1, 7)
         assert np.abs(sim.data.qpos[9:] - kept[f"{name}:qpos"][k, 9:] * GRAIN).max() <= EQUAL, seed
         assert np.abs(fixtures - kept[f"{name}:fixtures"][k] * GRAIN).max(initial=0.0) <= EQUAL, seed
@@ -178,7 +179,7 @@ def test_states_and_classes_of_other_tasks_are_refused() -> None:
 # --- predicates and rollouts ---
 
 
-@pytest.mark.parametrize("name", sorted({key.partition(":")[0] for key in record("predicates")}))
+@pytest.mark.parametrize("name", tasks_of("predicates"))
 def test_predicates_are_stock_liberos(name: str) -> None:
     kept = record("predicates")
     named, found = recorded_answers(simulate(name), kept, name)
@@ -202,7 +203,7 @@ def part_of(kind: str, start: str) -> dict[str, Any]:
     return {key.removeprefix(start): values for key, values in record(kind).items() if key.startswith(start)}
 
 
-@pytest.mark.parametrize("name", slow_but(sorted({key.partition(":")[0] for key in record("rollouts")}), [QUICK]))
+@pytest.mark.parametrize("name", slow_but(tasks_of("rollouts"), [QUICK]))
 def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
     sim, kept = simulate(name), part_of("rollouts", f"{name}:")
     sim.reset(7)

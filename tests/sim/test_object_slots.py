@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import POSE_RESOLUTION, ObjectSlots, classes
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -36,10 +36,6 @@ def table(sim: Simulation, slots: ObjectSlots | None = None) -> NDArray[np.float
     return found[:count]
 
 
-def column(rows: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    return rows[:, STARTS[name] : STARTS[name] + FIELDS[name]]
-
-
 def names(rows: NDArray[np.float32]) -> list[str]:
     return [classes()[int(kind)] for kind in rows[:, STARTS["class"]]]
 
@@ -65,16 +61,16 @@ def test_every_scene_fits_with_correct_poses(name: str) -> None:
     rows = table(sim)
     kinds = names(rows)
     assert sorted(kinds, key=classes().index) == kinds
-    places = column(rows, "position")
+    places = field(rows, "position")
     for place, kind in zip(places, kinds, strict=True):
         bodies = [asset for asset in sim.assets.values() if asset.class_name.startswith(kind)]
         if bodies:
             nearest = min(np.abs(sim.body_pose(asset.name)[0] - place).max() for asset in bodies)
             assert nearest < ROUNDED
     np.testing.assert_allclose(
-        np.linalg.norm(column(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=POSE_RESOLUTION
+        np.linalg.norm(field(rows, "rotation").reshape(-1, 2, 3), axis=2), 1.0, atol=POSE_RESOLUTION
     )
-    assert not column(rows, "highlighted").any()
+    assert not field(rows, "highlighted").any()
 
 
 def seen_pixels(sim: Simulation, name: str) -> int:
@@ -97,7 +93,7 @@ def test_visibility_agrees_with_pixels(name: str) -> None:
         episode.step(episode.expert_action())
         if step % 40:
             continue
-        places = column(table(sim, slots), "position")
+        places = field(table(sim, slots), "position")
         other.set_state(sim.state(), sim.fixture_poses())
         for asset in (asset.name for asset in sim.assets.values() if asset.kind == "object"):
             there = np.abs(places - sim.body_pose(asset)[0]).max(axis=1).min() < ROUNDED
@@ -118,7 +114,7 @@ def test_hidden_things_are_absent() -> None:
     put(sim, TOMATO, sim.site_pose(TOP)[0])
     rows = table(sim, slots)
     assert kind in names(rows)
-    drawn = column(rows[[k for k, name in enumerate(names(rows)) if name == "drawer"]], "joint")
+    drawn = field(rows[[k for k, name in enumerate(names(rows)) if name == "drawer"]], "joint")
     assert np.abs(drawn - articulation.open_q).min() < ROUNDED
     put(sim, TOMATO, np.array([-0.6, 0.0, 0.3]))  # below the table
     assert kind not in names(table(sim, slots))
@@ -158,9 +154,9 @@ def test_a_highlight_marks_its_object() -> None:
     place = sim.body_pose(chosen)[0]
     sim.highlights = (Highlight((float(place[0]), float(place[1]), float(place[2])), 0.02),)
     rows = table(sim)
-    lit = rows[column(rows, "highlighted")[:, 0] == 1]
+    lit = rows[field(rows, "highlighted")[:, 0] == 1]
     assert len(lit) == 1
-    np.testing.assert_allclose(column(lit, "position")[0], place, atol=ROUNDED)
+    np.testing.assert_allclose(field(lit, "position")[0], place, atol=ROUNDED)
 
 
 def test_poses_are_rounded_before_sorting() -> None:

@@ -158,13 +158,12 @@ def test_non_finite_state_is_refused(place: float) -> None:
 
 _FRAME = """
 import hashlib, os, sys
-from lerobot_memobench.sim.simulation import RenderSettings
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 
 def show():
-    frames = sim.render().tobytes() + sim.render("wrist").tobytes()
-    os.write(1, f"{hashlib.sha256(frames).hexdigest()}\\n".encode())  # one write: forks share the pipe
+    content = sim.state().tobytes() + sim.render().tobytes() + sim.render("wrist").tobytes()
+    os.write(1, f"{hashlib.sha256(content).hexdigest()}\\n".encode())  # one write: forks share the pipe
 
 sim = Simulation(get_task(sys.argv[1]), RenderSettings(quality=sys.argv[2]))
 sim.reset(7)
@@ -180,7 +179,7 @@ print("OpenGL.GL" in sys.modules)
 
 
 def frame_hashes(quality: str, forks: int = 0, **variables: str) -> list[str]:
-    """Return the hashes of frames drawn by a new process and its forks, and whether OpenGL was loaded."""
+    """Return the hashes of state and frames in a new process and its forks, and whether OpenGL was loaded."""
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", _FRAME, STOVE, quality, str(forks)],
         env={**os.environ, **variables},
@@ -195,7 +194,7 @@ def frame_hashes(quality: str, forks: int = 0, **variables: str) -> list[str]:
 def own_hash(quality: str) -> str:
     sim = Simulation(get_task(STOVE), RenderSettings(quality=quality))
     sim.reset(7)
-    return hashlib.sha256(sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest()
+    return hashlib.sha256(sim.state().tobytes() + sim.render().tobytes() + sim.render("wrist").tobytes()).hexdigest()
 
 
 @pytest.mark.parametrize("quality", ["default", pytest.param("high", marks=pytest.mark.slow)])
@@ -207,6 +206,6 @@ def test_frames_are_equal_in_every_process_without_gl(quality: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("variables", [{"NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": ""}, {"NUMBA_OPT": "0"}])
-def test_default_frames_are_equal_on_another_processor(variables: dict[str, str], tmp_path: Path) -> None:
+def test_states_and_frames_are_equal_on_another_processor(variables: dict[str, str], tmp_path: Path) -> None:
     """Compiled without this processor's vector instructions, and without optimisation."""
     assert frame_hashes("default", NUMBA_CACHE_DIR=str(tmp_path), **variables) == [own_hash("default"), "False"]

@@ -24,7 +24,6 @@ from lerobot_memobench.constants import (
     SPLITS,
     UNSEEDED,
 )
-from lerobot_memobench.envs.env import Interference
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
     EpisodeLog,
