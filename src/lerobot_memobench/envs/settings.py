@@ -49,8 +49,6 @@ PROMPT_IN = (AUTO, STEPS, RESET)
 its configuration. It waits while `observation.phase` is 0 and discards planned actions when it becomes 1. For other
 policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a known policy it means ``steps``."""
 
-REFERENT_VALUES = (*REFERENTS, DRAWN)
-"""Values of ``referent``; strict tasks always use the last one."""
 RELATIVE = "relative"
 QUALITIES = ("default", "high")
 EVERY = -1
@@ -152,7 +150,7 @@ class EnvSettings:
     referent: str = setting(
         "fixed",
         "the published goals; random: the seed decides the goal that the prompt shows; strict tasks are always drawn",
-        REFERENT_VALUES,
+        (*REFERENTS, DRAWN),
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks begin with their demonstration prompt")
     prompt_in: str = setting(
