@@ -1,12 +1,10 @@
 """Generate reference pages and task cards of the site, and adapt links that leave ``docs``: a hook of MkDocs.
 
-The pages are not committed. ``python scripts/docs_reference.py FOLDER`` writes them to a folder. Policy configurations
-are read from their source, without importing torch.
+The pages are not committed. Policy configurations are read from their source, without importing torch.
 """
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import html
@@ -61,9 +59,9 @@ PUBLIC = {
     "vla-evaluation-harness": ("vla_eval", "MEMOBench"),
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
-    "Metrics": ("evaluation.metrics", "Rate Summary summarise report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Contrast compare"),
-    "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
+    "Metrics": ("evaluation.metrics", "Rate Summary summary_of report_values wilson"),
+    "Comparison": ("evaluation.comparison", "Comparison Contrast compare_evaluations"),
+    "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
@@ -206,7 +204,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
 def spaces_page() -> str:
     """Return the page of observation and action spaces."""
     from lerobot_memobench import protocol
-    from lerobot_memobench.datasets.lerobot_format.columns import ACTION_NAMES, PROPRIO_NAMES
+    from lerobot_memobench.datasets.layout import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
     from lerobot_memobench.envs.pacing import longest
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
@@ -281,8 +279,8 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
-    from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
-    from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+    from lerobot_memobench.datasets.episodes import DemonstrationRecord
+    from lerobot_memobench.datasets.layout import MEANINGS, OBJECTS, dataset_features
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
@@ -299,7 +297,9 @@ def dataset_page() -> str:
         "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EpisodeRecord.meanings().items()]),
+        table(
+            ["column", "meaning"], [[code(name), meaning] for name, meaning in DemonstrationRecord.meanings().items()]
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -316,12 +316,13 @@ def schemas_page() -> str:
         ("Policy of a card", evaluation_file.Policy),
         ("Checkpoint of a card", evaluation_file.Checkpoint),
         ("One start", evaluation_file.Start),
-        ("Episodes of a card", evaluation_file.CardEpisode),
+        ("Settings of a card", evaluation_file.CardSettings),
     ]
     parts = [
         "# Log and card schemas",
-        "Files are validated against these types when they are read. Unknown fields are allowed. `null` is allowed if "
-        "the type includes `None`.",
+        "Files are validated against these types when they are read. `null` is allowed if the type includes `None`. "
+        "A line holds an outcome; settings, inputs and policy are in `evaluation.json` and apply to each line. Lines "
+        "with other fields are skipped, and files of another `format` are refused.",
     ]
     for heading, kind in wanted:
         summary = plain((kind.__doc__ or "").partition("\n\n")[0])
@@ -412,7 +413,7 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
 
 POLICIES = {
     "memobench_mem": ("policies/memobench_mem/configuration_memobench_mem.py", "MemobenchMemConfig"),
-    "memobench_remote": ("policies/remote/configuration_remote.py", "RemoteConfig"),
+    "memobench_remote": ("policies/remote.py", "RemoteConfig"),
 }
 
 
@@ -666,12 +667,14 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Adapt the links of a page that leave ``docs``, and fill in the board (called by MkDocs)."""
     found = relink(markdown, f"docs/{page.file.src_uri}", page.file.src_uri)
     if page.file.src_uri == BOARD_PAGE:
-        board = runpy.run_path(str(ROOT / "scripts" / "board_page.py"))
-        found = found.replace(board["PLACE"], board["table"]())
+        from tools.board.page import PLACE
+        from tools.board.page import table as board_table
+
+        found = found.replace(PLACE, board_table())
     return found
 
 
-def breakable(page: str) -> str:
+def on_page_content(content: str, **_: Any) -> str:
     """Allow line breaks in table cells after ``_``, ``.``, ``/`` and ``=`` of names, and prevent them in intervals."""
 
     def break_cell(match: re.Match[str]) -> str:
@@ -680,23 +683,4 @@ def breakable(page: str) -> str:
         cell = re.sub(r"\[[\d.]+–[\d.]+\]", r'<span class="interval">\g<0></span>', "".join(parts))
         return match[1] + cell + match[3]
 
-    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, page, flags=re.DOTALL)
-
-
-def on_page_content(content: str, **_: Any) -> str:
-    """Let wide tables fit (called by MkDocs)."""
-    return breakable(content)
-
-
-def main() -> None:
-    """Write the generated pages into the given folder."""
-    parser = argparse.ArgumentParser(description="Write the generated pages of the site into a folder.")
-    parser.add_argument("folder", type=Path)
-    out = parser.parse_args().folder
-    for path, make in PAGES.items():
-        (out / path).parent.mkdir(parents=True, exist_ok=True)
-        (out / path).write_text(make())
-
-
-if __name__ == "__main__":
-    main()
+    return re.sub(r"(<td[^>]*>)(.*?)(</td>)", break_cell, content, flags=re.DOTALL)

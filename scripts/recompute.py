@@ -1,7 +1,7 @@
 """Recompute the published figures from the kept rollouts; fail where a page differs.
 
 ``python scripts/recompute.py`` checks README, ``docs/benchmark/results.md`` and ``results/demonstrations.md``. The
-last cell of a table's row names the source of its figures: an evaluation in ``results/*/rollouts.parquet``, a run in
+last cell of a table's row names the source of its values: an evaluation in ``results/*/rollouts.parquet``, a run in
 ``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
 not kept*. Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be
 there.
@@ -44,8 +44,8 @@ FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
 """Columns of an evaluation by evidence."""
 INTERVAL = re.compile(r"[\d.]+\s\[[\d.]+–[\d.]+\]")
 
-Figures = Mapping[str, str]
-"""Heading of a column -> the figure in it."""
+Values = Mapping[str, str]
+"""Heading of a column -> the rate in it."""
 Tables = list[tuple[list[str], list[list[str]]]]
 """Headings and rows of each table of a page."""
 
@@ -68,7 +68,7 @@ def with_interval(*parts: float) -> str:
     return f"{value} [{low}–{high}]"
 
 
-def of_tasks(tasks: Mapping[str, Row]) -> Figures:
+def of_tasks(tasks: Mapping[str, Row]) -> Values:
     """Return the average's metrics, the SR of memory types and the number of rollouts, from rates per task."""
     types = {
         memory_type: mean_row(row for name, row in tasks.items() if get_task(name).memory_type == memory_type)
@@ -83,7 +83,7 @@ def of_tasks(tasks: Mapping[str, Row]) -> Figures:
     }
 
 
-def of_evaluation(folder: Path) -> Figures:
+def of_evaluation(folder: Path) -> Values:
     """Return the figures of an evaluation, counted as the report counts them."""
     (run,) = read_runs([folder])
     summary, evidence = run.summary, run.evidence.average if run.evidence else None
@@ -95,7 +95,7 @@ def of_evaluation(folder: Path) -> Figures:
     }
 
 
-def of_evidence(evidence: Evidence) -> Figures:
+def of_evidence(evidence: Evidence) -> Values:
     """Return how often choices followed the evidence, the chance without the past, and the number of scenes."""
     rate = evidence.rates[FOLLOWS]
     assert None not in (rate.value, rate.low, rate.high)
@@ -106,7 +106,7 @@ def of_evidence(evidence: Evidence) -> Figures:
     }
 
 
-def of_card(page: Path) -> Figures:
+def of_card(page: Path) -> Values:
     """Return the figures of the table per task in a shipped policy's card."""
     for head, rows in tables(page):
         if head[1:] == [ROLLOUTS, *METRICS]:
@@ -123,7 +123,7 @@ def _row(rollouts: int, cells: list[str]) -> Row:
     }
 
 
-def of_demonstrations(file: Path, run: str) -> Figures:
+def of_demonstrations(file: Path, run: str) -> Values:
     """Return the expert's SR on the seeds of a run."""
     table = pq.read_table(file, columns=["run", "solved"]).to_pydict()
     solved = [done for name, done in zip(table["run"], table["solved"], strict=True) if name == run]
@@ -133,7 +133,7 @@ def of_demonstrations(file: Path, run: str) -> Figures:
 
 
 @cache
-def of_kept(kept: Path, name: str) -> Figures:
+def of_kept(kept: Path, name: str) -> Values:
     """Return the figures of a kept evaluation."""
     with tempfile.TemporaryDirectory() as folder:
         restore(kept, Path(folder), [name])
@@ -152,7 +152,7 @@ def tables(page: Path) -> Tables:
     return found
 
 
-def source_of(page: Path, cell: str) -> Figures | None:
+def source_of(page: Path, cell: str) -> Values | None:
     """Return the figures of the source that a cell links, None where it links none that can be recomputed."""
     for name, target in re.findall(r"\[`?([^\]`]+)`?\]\(([^)#]+)\)", cell):
         file = (page.parent / target).resolve()
@@ -165,7 +165,7 @@ def source_of(page: Path, cell: str) -> Figures | None:
     return None
 
 
-def rows_of(page: Path) -> Iterator[tuple[list[str], Figures, str]]:
+def rows_of(page: Path) -> Iterator[tuple[list[str], Values, str]]:
     """Yield each row of results of a page, its cells under known headings, and the cell that names its source.
 
     A row of results is one with an interval, or of a table of SR or of memory types.
@@ -182,12 +182,12 @@ def problems_of_tables(page: Path) -> list[str]:
     """Return the errors in a page's rows of results: figures that differ from the source, or no source."""
     found = []
     for row, cells, source in rows_of(page):
-        figures = source_of(page, source)
-        if figures is None and NOT_KEPT not in source:
+        values = source_of(page, source)
+        if values is None and NOT_KEPT not in source:
             found.append(f"{page.name}: {row[0]} links no source and lacks {NOT_KEPT!r}")
         for name, cell in cells.items():
-            if figures is not None and cell != figures.get(name):
-                found.append(f"{page.name}: {row[0]} has {name} {cell}, and {figures.get(name)} by its source")
+            if values is not None and cell != values.get(name):
+                found.append(f"{page.name}: {row[0]} has {name} {cell}, and {values.get(name)} by its source")
     return found
 
 

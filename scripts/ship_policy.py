@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
+from lerobot_memobench.datasets.episodes import read_manifest
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
@@ -37,7 +37,7 @@ from lerobot_memobench.tasks.task import DRAWN
 TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
-OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
+OF_THE_DATA = ("input_features", "output_features", "object_classes")
 """Settings of a policy that its dataset decides."""
 OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
 """Words of an evaluation's command that a card does not repeat."""
@@ -51,13 +51,7 @@ tags: [lerobot, memobench, memory]
 """
 
 
-def ship(
-    run: Path,
-    name: str,
-    rollouts: Path | None,
-    merged: Mapping[Path, Sequence[Path]],
-    commits: Sequence[tuple[str, str]],
-) -> Path:
+def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequence[Path]]) -> Path:
     """Write the last checkpoint of a training run as the package's policy ``name``; return its folder."""
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
@@ -70,7 +64,7 @@ def ship(
         shutil.copy(path, folder)
     config = json.loads((source / "config.json").read_text()) | {"device": "cpu", "pretrained_path": None}
     write_file(folder / "config.json", json.dumps(config, indent=4) + "\n")
-    write_file(folder / "README.md", card(name, source, weights, rollouts, merged, commits))
+    write_file(folder / "README.md", card(name, source, weights, rollouts, merged))
     size = sum(path.stat().st_size for path in folder.iterdir())
     if size > LARGEST:
         raise SystemExit(f"{folder} takes {size:,} bytes; expected at most {LARGEST:,}")
@@ -83,14 +77,8 @@ def card(
     weights: dict[str, torch.Tensor],
     rollouts: Path | None,
     merged: Mapping[Path, Sequence[Path]],
-    commits: Sequence[tuple[str, str]] = (),
 ) -> str:
-    """Return the Markdown that goes with a policy.
-
-    Args:
-        merged: datasets, and those that LeRobot made each of.
-        commits: datasets, and by which commit each was made, where the expert has changed since.
-    """
+    """Return the Markdown that goes with a policy; ``merged``: datasets, and those that LeRobot made each of."""
     runs = trainings(source)
     begun = runs.pop(0) if "shipped" in runs[0] else None
     policy = runs[-1]["policy"]
@@ -101,7 +89,6 @@ def card(
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; reads {policy['perception']}.",
         *([] if begun is None else [began_with(begun["folder"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
-        *(f"The expert that made {place(part)} is that of commit `{commit}`." for part, commit in commits),
         "",
         "```bash",
         *(
@@ -291,17 +278,9 @@ if __name__ == "__main__":
         metavar=("DATASET", "PART"),
         help="a training dataset, and those that lerobot-edit-dataset merged into it; repeatable, in order",
     )
-    parser.add_argument(
-        "--commit",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("DATASET", "COMMIT"),
-        help="commit of a dataset's expert, where the expert has changed since; repeatable",
-    )
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
     if str(given.run) == given.name and given.rollouts is not None:
         print(retell(given.name, given.rollouts))
     else:
-        print(ship(given.run, given.name, given.rollouts, parts, given.commit))
+        print(ship(given.run, given.name, given.rollouts, parts))

@@ -42,7 +42,7 @@ from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.training.command import take_training_options
 from research import kept
-from tests.support.logs import rollout
+from tests.support.logs import rollout, write_log
 from tests.support.scripts import load_script
 
 reference = load_script("docs_reference")
@@ -267,7 +267,7 @@ def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str
 
 def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
     """Keep a log under the name ``one`` in the folder's tables."""
-    episode_log.write_episodes(folder / "logs" / "one", lines)
+    write_log(folder / "logs" / "one", lines)
     kept.keep(folder / "logs", ["one"], folder)
 
 
@@ -534,7 +534,7 @@ def test_policy_page_lists_all_settings() -> None:
 
 def test_cells_break_within_names_but_not_intervals() -> None:
     page = '<p>a_b</p><td><a href="x_y.html"><code>env.obs_type</code></a> 97.9 [96.9–98.5]</td>'
-    assert reference.breakable(page) == (
+    assert reference.on_page_content(page) == (
         '<p>a_b</p><td><a href="x_y.html"><code>env.<wbr>obs_<wbr>type</code></a> '
         '97.9 <span class="interval">[96.9–98.5]</span></td>'
     )
@@ -550,16 +550,6 @@ def test_links_to_files_outside_the_site_are_adapted() -> None:
     assert (
         reference.relink("[d](docs/develop.md)", "CONTRIBUTING.md", "develop/contributing.md") == "[d](../develop.md)"
     )
-
-
-def test_reference_pages_take_no_option_for_a_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """`--help` prints the usage; it once made a folder of this name, which was committed."""
-    monkeypatch.chdir(tmp_path)
-    for argument in ("--help", "--out"):
-        monkeypatch.setattr(sys, "argv", ["docs_reference.py", argument])
-        with pytest.raises(SystemExit):
-            reference.main()
-    assert not list(tmp_path.iterdir())
 
 
 def test_memory_guides_are_complete() -> None:

@@ -18,7 +18,7 @@ from pydantic import AfterValidator
 
 import lerobot_memobench
 from lerobot_memobench.cli.console import as_path
-from lerobot_memobench.datasets.lerobot_format.record import from_frames
+from lerobot_memobench.datasets.episodes import from_frames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,

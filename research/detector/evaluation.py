@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from lerobot_memobench.datasets.lerobot_format.card import markdown as table
+from lerobot_memobench.datasets.card import markdown as table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 from lerobot_memobench.perception.detector import Detections, detections
@@ -60,7 +60,7 @@ def evaluate(file: Path, folder: Path, pictures: Callable[[], Pictures]) -> str:
     found = figures(*outcomes(localising(ObjectLocalizer(detector)), pictures()))
     folder.mkdir(parents=True, exist_ok=True)
     write_file(folder / NUMBERS, json.dumps(found, indent=1, allow_nan=False))
-    text = markdown(found)
+    text = results_table(found)
     write_file(folder / TABLE, text)
     return text
 
@@ -173,7 +173,7 @@ def _percentile(values: NDArray[Any], percent: int) -> float | None:
     return round(found, 4) if math.isfinite(found) else None
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
+def results_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the table of `figures`."""
     cells = [
         [

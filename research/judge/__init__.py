@@ -1,1 +1,1 @@
-"""Test the judge: near misses of every task, their verdicts, and mutants of the code that gives them."""
+"""Test the judge: near misses of every task and their verdicts."""

@@ -1,4 +1,4 @@
-"""``python -m research.judge``: false positives and negatives of the judge on near misses, and surviving mutants.
+"""``python -m research.judge``: false positives and negatives of the judge on near misses.
 
 Verdicts of a task are appended to ``cases.jsonl``; the same command continues an interrupted run.
 """
@@ -16,7 +16,8 @@ import typer
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import SUITES, Task
 from research.command import run
-from research.judge.mutants import Battery, is_not_shown, killer, mutants
+from research.judge.cases import cases_of
+from research.judge.stage import Stage, judge
 
 
 class Row(NamedTuple):
@@ -35,12 +36,14 @@ def variant_of(name: str) -> Task:
     return task.variant(task.random_variants[-1])
 
 
-def rows_of(battery: Battery) -> list[Row]:
+def rows_of(name: str) -> list[Row]:
     """Return the verdicts on a task's cases."""
-    task = battery.task
+    task = variant_of(name)
+    stage = Stage(task)
     return [
-        Row(task.name, task.suite, one.case.kind, one.case.accepted, one.case.is_accepted(task, one.verdict))
-        for one in battery.judgements
+        Row(name, task.suite, case.kind, case.accepted, case.is_accepted(task, judge(stage, recording, case.choice)))
+        for case in cases_of(stage)
+        for recording in [stage.record(case.moves)]
     ]
 
 
@@ -64,29 +67,18 @@ def _wrong(rows: Sequence[Row]) -> str:
 def judged(
     out: Annotated[Path, typer.Option(help="Folder of the verdicts; the same command continues a run.")],
     tasks: Annotated[list[str] | None, typer.Option(help="Names of tasks; all of both suites if omitted.")] = None,
-    with_mutants: Annotated[bool, typer.Option("--mutants", help="Test mutants of the judge on these tasks.")] = False,
 ) -> None:
     """Judge right episodes and near misses of every task; print wrong verdicts by kind."""
     out.mkdir(parents=True, exist_ok=True)
     log = out / "cases.jsonl"
     rows = [Row(*json.loads(line)) for line in log.read_text().splitlines()] if log.is_file() else []
-    names, done = tasks or task_names(suite=None), {row.task for row in rows}
-    batteries: list[Battery] = []
-    for name in names:
-        if name in done and not with_mutants:
-            continue
-        batteries.append(Battery(variant_of(name)))
-        if name not in done:
-            found = rows_of(batteries[-1])
-            rows += found
-            with log.open("a") as file:
-                file.writelines(json.dumps(row) + "\n" for row in found)
+    names = tasks or task_names(suite=None)
+    for name in [name for name in names if name not in {row.task for row in rows}]:
+        verdicts = rows_of(name)
+        rows += verdicts
+        with log.open("a") as file:
+            file.writelines(json.dumps(row) + "\n" for row in verdicts)
     print(table([row for row in rows if row.task in names]))
-    if with_mutants:
-        batteries.sort(key=lambda one: one.task.suite, reverse=True)  # strict tasks kill most
-        tried = [mutant for mutant in mutants() if not is_not_shown(mutant)]
-        survivors = [mutant.name for mutant in tried if killer(mutant, batteries) is None]
-        print(f"\nmutants killed: {len(tried) - len(survivors)} of {len(tried)}", *survivors, sep="\n")
 
 
 if __name__ == "__main__":

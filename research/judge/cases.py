@@ -15,7 +15,7 @@ from lerobot_memobench.experts.expert import counts_events, plan_of, steps_of
 from lerobot_memobench.tasks.evidence import handled_atoms
 from lerobot_memobench.tasks.formula import Atom, Hold, Not
 from lerobot_memobench.tasks.task import STRICT, Task
-from research.judge.stage import DWELL, Move, Stage, Trace, Verdict, judge, trace
+from research.judge.stage import DWELL, Move, Stage, Verdict, judge
 
 OPEN, JUST_OPEN = 1.1, 1.02
 """Positions of a joint as shares of the way to its bound."""
@@ -91,7 +91,7 @@ class _Cases:
                 self.stage.do(move)
                 moves.append(move)
         # A plan may go on after the goal is reached.
-        steps_to_goal = judge(self.task, self._trace(tuple(moves))).steps
+        steps_to_goal = judge(self.stage, self.stage.record(tuple(moves))).steps
         return tuple(move for i, move in enumerate(moves) if sum(one.steps for one in moves[:i]) < steps_to_goal)
 
     def _moves_of(self, step: Atom | Hold, opened: set[str]) -> Moves:
@@ -142,17 +142,14 @@ class _Cases:
 
     def _of_checkpoints(self) -> Iterator[Case]:
         """Yield near misses of the move that completes each checkpoint."""
-        done, whole = 0, self._trace(self.right)
-        for i, move in enumerate(self.right):
-            before, done = done, judge(self.task, whole[: 2 * (i + 1)]).checkpoints
+        whole = self.stage.record(self.right)
+        counts = [0, *(judge(self.stage, whole[: i + 1]).checkpoints for i in range(len(whole)))]
+        for i, (move, before, done) in enumerate(zip(self.right, counts, counts[1:], strict=False)):
             for k in range(before, done):
                 goal = self.task.checkpoints[k].goal
                 inside = any(isinstance(part, Not) for part in (goal, *getattr(goal, "children", ())))
                 for kind, moves in self._out_of_place(move) if inside else self._nearly(move, self.right[i - 1]):
                     yield Case(kind, (*self.right[:i], *moves), checkpoint=k + 1)
-
-    def _trace(self, moves: Moves) -> Trace:
-        return trace(self.stage.sim, self.task, self.stage.start, self.stage.record(moves))
 
     def _nearly(self, move: Move, previous: Move) -> Iterator[tuple[str, Moves]]:
         if move.opens:

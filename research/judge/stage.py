@@ -1,14 +1,13 @@
 """Set states of a task's scene move by move, without physics, and judge sequences of states.
 
-A recording holds states with the number of control steps that each lasts. `trace` evaluates the task's atoms on a
-recording, `judge` its checkpoints, goal and choice as `envs.episode` does, once per control step.
+A recording holds states with the number of control steps that each lasts. `judge` evaluates checkpoints, goal and
+choice as `envs.episode` does, once per control step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
@@ -29,12 +28,11 @@ AWAY = 0.2
 """Rotation of the arm's first joint that takes the hand away from home, rad."""
 CLEAR, COARSE, FINE = 0.15, 0.006, 0.0005
 """Height above a target from which an object is lowered, and the steps of lowering, m."""
-ARM = len(robot.ARM_JOINTS) + len(robot.FINGER_JOINTS)
+ARM = robot.OTHERS.start
 """Positions of arm and fingers, the first of a state."""
 
 Array = NDArray[np.float64]
 Recording = list[tuple[Array, int]]
-Trace = list[tuple[frozenset[Atom], int]]
 
 
 @dataclass(frozen=True)
@@ -95,9 +93,11 @@ class Stage:
         self.recording: Recording = []
 
     def restart(self) -> None:
-        """Return to the start of the execution."""
+        """Begin the execution in its first state, which lasts."""
         self.recording = []
-        begin(self.sim, self.start)
+        self.sim.set_state(self.start)
+        self.sim.set_state(self.start)
+        self.sim.begin_execution()
 
     def do(self, move: Move) -> None:
         """Carry out a move and record the state."""
@@ -198,54 +198,26 @@ class Stage:
         mujoco.mj_step1(self.sim.model, self.sim.data)
 
 
-class Judged(Protocol):
-    """The part of a simulation that judges states."""
-
-    def set_state(self, state: Array) -> None:
-        """Set a state; the one before it is its predecessor."""
-
-    def begin_execution(self) -> None:
-        """Store the state as the start of the execution."""
-
-    def holds(self, atom: Atom) -> bool:
-        """Return whether an atom is true."""
-
-
-def begin(sim: Judged, start: Array) -> None:
-    """Begin the execution in a state that lasts."""
-    sim.set_state(start)
-    sim.set_state(start)
-    sim.begin_execution()
-
-
-def trace(sim: Judged, task: Task, start: Array, recording: Recording) -> Trace:
-    """Return the true atoms of a recording, of all formulas that `judge` evaluates; two entries for each state."""
+def judge(stage: Stage, recording: Recording, choices: bool = False) -> Verdict:
+    """Judge a recording; ``choices``: whether the choice is judged as well."""
+    task, sim = stage.task, stage.sim
     variants = [task, *map(task.variant, task.random_variants)]
     formulas = [goal for one in variants for goal in (one.goal, *(checkpoint.goal for checkpoint in one.checkpoints))]
-    found = {atom for formula in formulas for atom in atoms(formula)}
-    found |= {atom for one in variants for atom in handled_atoms(one)}
-    asked = {Atom(LATCHES.get(atom.predicate, atom.predicate), atom.args) for atom in found}
-    begin(sim, start)
-    result: Trace = []
-    for state, steps in recording:
-        for count in (1, steps - 1):  # all steps but the first have an equal predecessor
-            sim.set_state(state)
-            result.append((frozenset(filter(sim.holds, asked)) if count else frozenset(), count))
-    return result
-
-
-def judge(task: Task, found: Trace, make: Callable[[Task], Progress] = Progress, choices: bool = False) -> Verdict:
-    """Judge a trace; ``make`` returns the progress of a task, ``choices``: whether the choice is judged as well."""
-    progress, choice = make(task), Choice(task) if choices else None
+    named = {atom for formula in formulas for atom in atoms(formula)}
+    named |= {atom for one in variants for atom in handled_atoms(one)}
+    asked = {Atom(LATCHES.get(atom.predicate, atom.predicate), atom.args) for atom in named}
+    progress, choice = Progress(task), Choice(task) if choices else None
     success = lost = False
-    for true, steps in found:
-        for _ in range(steps):
-            success = progress.step(true.__contains__)
-            if choice is not None:
-                choice.step(true.__contains__)
-            lost = progress.lost and task.suite == STRICT
-            if success or lost:
-                break
-        if success or lost:
-            break
+    stage.restart()
+    for state, steps in recording:
+        for count in (1, steps - 1):  # all steps but the first have an equal predecessor, so equal atoms
+            sim.set_state(state)
+            true = frozenset(filter(sim.holds, asked)) if count else frozenset()
+            for _ in range(count):
+                success = progress.step(true.__contains__)
+                if choice is not None:
+                    choice.step(true.__contains__)
+                lost = progress.lost and task.suite == STRICT
+                if success or lost:
+                    return Verdict(success, lost, progress.index, choice.variant if choice else None, progress.steps)
     return Verdict(success, lost, progress.index, choice.variant if choice else None, progress.steps)

@@ -6,8 +6,8 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from lerobot_memobench.io import draft_of
 from lerobot_memobench.tasks.task import STRICT
-from research.drawing import pyplot, save
 from research.memory_study.grid import Grid
 from research.memory_study.tables import figures_of_rows
 
@@ -19,7 +19,11 @@ ROW_HEIGHT, PANEL_WIDTH = 0.32, 5.6
 
 def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     """Draw the evaluated rows to ``path``, each suite's by descending success; return it, or None without any."""
-    plt = pyplot()
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
     suites = {suite: found for suite in grid.suites if (found := figures_of_rows(grid, out, suite))}
     if not suites:
         return None
@@ -36,7 +40,10 @@ def draw(grid: Grid, out: Path, path: Path) -> Path | None:
     figure.legend(
         handles.values(), handles.keys(), loc="outside lower center", ncols=2 * len(suites), frameon=False, fontsize=9
     )
-    return save(figure, path)
+    with draft_of(path) as draft:
+        figure.savefig(draft, dpi=130)
+    plt.close(figure)
+    return path
 
 
 def _draw_suite(axis: Any, suite: str, found: dict[str, dict[str, Any]]) -> None:

@@ -35,7 +35,7 @@ class Suite:
     Attributes:
         demonstrations: words of ``memobench generate``. evaluation: of ``lerobot eval env=memobench``.
         tasks: tasks or memory types to learn and roll out; none: all.
-        ceilings: task -> best success without a memory, per cent: found (``research.necessity``), or exact.
+        ceilings: task -> best success without a memory, per cent (``research.necessity.adversaries``).
     """
 
     demonstrations: list[str]

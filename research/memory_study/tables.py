@@ -10,7 +10,7 @@ from statistics import mean
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
+from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_run, read_runs
 from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
@@ -183,13 +183,13 @@ def _evidence(cells: Sequence[Cell]) -> list[dict[str, Any]]:
 
 
 def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
-    header = ("", "training seeds", "SR", "95 %", "of seeds", *METRICS[1:])
+    header = ("", "training seeds", "SR", "95 %", "of seeds", *PROCESS_METRICS)
     more = ("follows evidence, last seed", "chance", "scenes")
     lines = [_summary_line(row, cells) for row, cells in rows.items()]
     if ceilings:
         empty = [EMPTY] * (len(header + more) - 3)
         lines.insert(0, [FOUND_WITHOUT, EMPTY, _figure(_ceiling(ceilings)), *empty])
-    return markdown((*header, *more), lines)
+    return table_of((*header, *more), lines)
 
 
 def _ceiling(ceilings: Mapping[str, float]) -> float | None:
@@ -212,7 +212,7 @@ def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
         str(len(cells)),
         *_with_interval(average_success(_runs(cells))),
         ", ".join(f"{report['average']['SR']:.0f}" for report in reports),
-        *(_average(reports, metric) for metric in METRICS[1:]),
+        *(_average(reports, metric) for metric in PROCESS_METRICS),
         *columns,
     ]
 
@@ -227,7 +227,7 @@ def _by_memory_type(rows: Rows) -> str:
             _mean([(one.get(kind) or {}).get(metric) for one in types]) for kind in MEMORY_TYPES for metric in METRICS
         ]
         lines.append([row, *rates])
-    return markdown(header, lines)
+    return table_of(header, lines)
 
 
 def by_task(rows: Rows) -> tuple[list[str], dict[str, list[float | None]]]:
@@ -245,7 +245,7 @@ def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
         [f"`{name}`", *map(_figure, (ceilings.get(name), *values))]
         for name, *values in zip(names, *solved.values(), strict=True)
     ]
-    return markdown(("", FOUND_WITHOUT, *rows), lines)
+    return table_of(("", FOUND_WITHOUT, *rows), lines)
 
 
 def _endings(rows: Rows) -> str:
@@ -255,7 +255,7 @@ def _endings(rows: Rows) -> str:
             counts[row].update(success=one["average"]["n"] - sum(one["failures"].values()), **one["failures"])
     classes = list(dict.fromkeys(name for count in counts.values() for name in count))
     lines = [[name.replace("_", " "), *(str(counts[row][name]) for row in rows)] for name in classes]
-    return markdown(("", *rows), lines)
+    return table_of(("", *rows), lines)
 
 
 def _conditions(rows: Rows) -> str:
@@ -270,7 +270,7 @@ def _conditions(rows: Rows) -> str:
         for row, own in there.items()
         if own
     ]
-    return markdown(("", "as it is", *wanted), lines) if lines else ""
+    return table_of(("", "as it is", *wanted), lines) if lines else ""
 
 
 def _condition(cell: Cell, part: str, parts: Sequence[str]) -> str:
@@ -290,9 +290,9 @@ def _sealed(rows: Rows) -> str:
         if tested := [cell for cell in cells if evaluated(cell, SEALED)]:
             success = average_success(_runs(tested, SEALED))
             reports = [report(cell, SEALED) for cell in tested]
-            averages = [_average(reports, metric) for metric in METRICS[1:]]
+            averages = [_average(reports, metric) for metric in PROCESS_METRICS]
             lines.append([row, str(len(tested)), *_with_interval(success), *averages])
-    return markdown(("", "training seeds", "SR", "95 %", *METRICS[1:]), lines) if lines else ""
+    return table_of(("", "training seeds", "SR", "95 %", *PROCESS_METRICS), lines) if lines else ""
 
 
 def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
@@ -307,7 +307,7 @@ def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
             f"{100 * (one or 0.0) - ceiling:+.1f}" for one in (success.value, success.low, success.high)
         )
         lines.append([row, str(len(cells)), value, f"{low} to {high}"])
-    return markdown(("", "training seeds", "difference, points", "95 %"), lines)
+    return table_of(("", "training seeds", "difference, points", "95 %"), lines)
 
 
 def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
@@ -337,7 +337,7 @@ def _contrasts_table(found: Mapping[str, SeedContrast], reference: str) -> str:
         for name, each in found.items()
     ]
     tests = ("p of episodes (Holm)", "of training seeds", "p of training seeds (Holm)")
-    return markdown(("", "episodes", "difference, points", "95 %", *tests, "detectable"), lines)
+    return table_of(("", "episodes", "difference, points", "95 %", *tests, "detectable"), lines)
 
 
 def _probability(p: float | None) -> str:
@@ -346,7 +346,7 @@ def _probability(p: float | None) -> str:
     return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
 
@@ -360,7 +360,7 @@ def _costs(rows: Rows) -> str:
         lines.append(
             [row, _mean(trained), _mean([1000 * sum(one["wall_s"] for one in run) / _steps(run) for run in runs])]
         )
-    return markdown(("", "training, min", "a simulated step, prompt included, ms"), lines)
+    return table_of(("", "training, min", "a simulated step, prompt included, ms"), lines)
 
 
 def _steps(records: Sequence[Record]) -> int:

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
-import random
 import shutil
-import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import protocol_of_log, read_run
 from lerobot_memobench.jobs.threads import PROCESSES
+from lerobot_memobench.run.card import run_facts
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
 from research.memory_study import cells, commands
@@ -31,7 +25,7 @@ from research.memory_study.commands import Cost, has_ended
 from research.memory_study.grid import GRID_FILE, ROLLOUTS, SEALED, TRAINING, Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
 from research.necessity.adversaries import ceiling
-from tests.support.logs import rollout
+from tests.support.logs import card, rollout, write_log
 
 FIND = "find_the_artichoke_hidden_in_one_of_the_drawers"
 BUTTER = "put_only_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -268,55 +262,6 @@ def test_failed_demonstrations_need_their_dataset(grid: Grid, tmp_path: Path, mo
     assert data.finished()
 
 
-TINY = """
-policy: [policy=memobench_mem, size=small, perception=objects]
-training: [steps=8, save_freq=2]
-evaluation: [split=validation, episodes=2, videos=0, env.horizon=120]
-suites:
-  strict:
-    demonstrations: [--suite, strict, --episodes, "3", --no-images]
-    evaluation: [suite=strict]
-    tasks: [find_the_artichoke_hidden_in_one_of_the_drawers]
-rows:
-  frames: {training: []}
-"""
-
-
-@pytest.mark.slow
-def test_a_study_killed_at_ten_random_moments_has_the_same_results(tmp_path: Path) -> None:
-    (tmp_path / "grid.yaml").write_text(TINY)
-    command = [sys.executable, "-m", "research.memory_study", "--grid", str(tmp_path / "grid.yaml"), "--out"]
-    subprocess.run([*command, str(tmp_path / "whole")], check=True, capture_output=True)
-    rng, killed = random.Random(0), 0
-    while True:
-        study = subprocess.Popen(
-            [*command, str(tmp_path / "killed")], start_new_session=True, stdout=subprocess.DEVNULL
-        )
-        try:
-            study.wait(rng.uniform(4, 40) if killed < 10 else None)
-        except subprocess.TimeoutExpired:
-            os.killpg(study.pid, signal.SIGKILL)
-            study.wait()
-            killed += 1
-            continue
-        break
-    assert study.returncode == 0
-    assert killed >= 5, "the machine was too fast; draw shorter times"
-    whole, other = (
-        Cell(read_grid(tmp_path / "grid.yaml"), tmp_path / name, "strict", "frames", 0) for name in ("whole", "killed")
-    )
-    weights, others = (
-        (cell.policy / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
-        for cell in (whole, other)
-    )
-    assert weights == others
-    outcomes, others = (
-        [{k: v for k, v in one.items() if k not in ("wall_s", "run", "policy")} for one in read_run(folder).records]
-        for folder in (cell.evaluation(ROLLOUTS) for cell in (whole, other))
-    )
-    assert outcomes == others
-
-
 # --- tables ---
 
 
@@ -334,12 +279,11 @@ def evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **mor
     """Let these parts of a cell be evaluated, with so many rollouts each."""
     for part in parts:
         episodes = [rollout_of(episode, part == "evidence", solved) | more for episode in range(rollouts)]
-        write_episodes(cell.evaluation(part), episodes)
-        card = {
-            "protocol": protocol_of_log(episodes),
-            "runs": [{"command": [*cell.carded_words(part), "resume=true"]}],
-        }
-        (cell.evaluation(part) / EVALUATION_FILE).write_text(json.dumps(card))
+        (cell.evaluation(part) / "evaluation.json").unlink(missing_ok=True)
+        folder = write_log(cell.evaluation(part), episodes)
+        protocol = {**read_evaluation(folder)["protocol"], "tasks": [BUTTER], "episodes": rollouts}
+        start = run_facts([*cell.carded_words(part), "resume=true"], 1)
+        write_evaluation(folder, card(protocol, read_evaluation(folder)["policy"], runs=[start]))
     for part in (*parts, TRAINING):
         words = cell.training_words() if part == TRAINING else cell.evaluation_words(part)
         cell.log(part).with_suffix(".json").write_text(json.dumps({**COMMAND, "words": words, "ended": True}))
@@ -418,7 +362,7 @@ def test_inconsistent_results_are_refused(no_memory: Cell, frames: Cell, tmp_pat
         case "log":
             frames.log(ROLLOUTS).with_suffix(".json").write_text('{"ended": true}')
         case "card":
-            (folder / EVALUATION_FILE).unlink()
+            (folder / "evaluation.json").unlink()
         case "row":
             shutil.copytree(no_memory.evaluation(ROLLOUTS), folder, dirs_exist_ok=True)
         case "cut":

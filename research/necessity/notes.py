@@ -1,6 +1,6 @@
 """Motions by which a policy without a memory uses the scene as a notebook, or looks into a drawer.
 
-The scripted adversaries make them, and the search tries them as answers.
+The scripted adversaries of both commands make them.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ import pytest
 from lerobot_memobench.board.submission import About, write_submission
 from tests.support import browser as chromium
 from tests.support.board import ABOUT, evaluation
-from tests.support.scripts import load_script
+from tools.board import page as board
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -21,7 +21,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 def test_board_is_sorted_by_a_click(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page has the heading *Board*, whose id is ``board``, as MkDocs makes it."""
     markdown = pytest.importorskip("markdown", reason="the dependencies of the site are missing")
-    board = load_script("board_page")
     for k, name in enumerate(("one", "two")):
         made = evaluation(tmp_path / name, speed=50 + 40 * k, evidence=k == 0)
         about = About(**ABOUT | {"model": name.title(), "parameters": 10 + k})

@@ -18,8 +18,8 @@ from rich.console import Console, RenderableType
 
 from lerobot_memobench.cli.console import counting, one_sentence, run_command
 from lerobot_memobench.cli.memobench import task_table
-from lerobot_memobench.evaluation.metrics import summarise
-from lerobot_memobench.evaluation.report_tables import rates_table
+from lerobot_memobench.evaluation.metrics import summary_of
+from lerobot_memobench.evaluation.report import rates_table
 from lerobot_memobench.evaluation.tables import Unbroken, terminal_table
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
@@ -63,7 +63,7 @@ def tables() -> dict[str, RenderableType]:
         }
         for task in found
     ]
-    return {"tasks": Unbroken(task_table(found), column=1), "report": terminal_table(rates_table(summarise(solved)))}
+    return {"tasks": Unbroken(task_table(found), column=1), "report": terminal_table(rates_table(summary_of(solved)))}
 
 
 @pytest.mark.parametrize("terminal", [True, False])

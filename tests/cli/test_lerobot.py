@@ -20,15 +20,15 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID
-from lerobot_memobench.envs.episode_log import EpisodeLog
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID
+from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.command_line import OPTIONS, SHORT_FORMS, parse_words
 from lerobot_memobench.run.plan import EvaluationPlan
-from lerobot_memobench.training.resume import resumed
+from lerobot_memobench.training.command import with_last_checkpoint
 from tests.support import logs
 from tests.support.fake_loop import STOVE, FakeLoop
 
@@ -39,12 +39,10 @@ class Called:
     def __init__(self) -> None:
         self.flags: list[str] | None = None
         self.config: Any = None
-        self.config_path: str | None = None
         self.action: Callable[[], Any] = lambda: 0
 
-    def __call__(self, config: Any = None, config_path: str | None = None) -> Any:
+    def __call__(self, config: Any = None) -> Any:
         self.flags, self.config = sys.argv[1:], config
-        self.config_path = config_path or self.config_path
         return self.action()
 
     def value(self, key: str) -> Any:
@@ -62,14 +60,8 @@ def theirs(monkeypatch: pytest.MonkeyPatch, fake_loop: FakeLoop) -> Called:
 def training(monkeypatch: pytest.MonkeyPatch, fake_loop: FakeLoop) -> Called:
     called = Called()
     package = "lerobot_memobench.training"
-    monkeypatch.setattr(f"{package}.command.run_lerobot", called)
-    monkeypatch.setattr(f"{package}.view.viewed", lambda config, *_: config)
-
-    def complete(config: Any, asked: Any) -> Any:
-        called.config_path = asked.config_path
-        return config
-
-    monkeypatch.setattr(f"{package}.configuration.complete", complete)
+    monkeypatch.setattr(f"{package}.trainer.run_lerobot", called)
+    monkeypatch.setattr(f"{package}.trainer.prepare", lambda config, *_: config)
     monkeypatch.setattr(f"{package}.loop.train", called)
     monkeypatch.setattr(f"{package}.command.cores", lambda: 8)
     return called
@@ -116,7 +108,7 @@ def test_help_explains_every_short_form(
 
 
 def test_an_evaluation_writes_and_prints_its_report(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
-    surplus = logs.record(STOVE, 3, seed=10, replan_steps=None)
+    surplus = line_of(logs.record(STOVE, 3))
     fake_loop.before = lambda plan: EpisodeLog(plan.log).append(surplus)  # as plain lerobot-eval does
     assert main(["eval", "env=memobench", f"tasks={STOVE}", "episodes=2", "output_dir=out"]) == 0
     average = json.loads(Path("out/report.json").read_text())["average"]
@@ -145,7 +137,7 @@ def test_errors_in_a_run(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
     def fail(plan: EvaluationPlan) -> None:
         (plan.output / "videos").mkdir(parents=True)
         if finished:
-            EpisodeLog(plan.log).append(logs.record(STOVE))
+            EpisodeLog(plan.log).append(line_of(logs.record(STOVE)))
         try:
             raise MemobenchError("the scene\nis wrong")
         except MemobenchError as error:
@@ -253,7 +245,6 @@ def test_the_clock_needs_no_statistics(tmp_path: Path) -> None:
 
 # --- train ---
 
-LAST_CONFIG = "run/checkpoints/last/pretrained_model/train_config.json"
 EMPTY_DATASET = json.dumps({"codebase_version": "v3.0", "total_episodes": 0, "total_frames": 0, "features": {}})
 
 
@@ -299,10 +290,10 @@ DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
         {"policy.align": "semantic", "dataset.repo_id": "a/b", "policy.push_to_hub": False, "steps": 100_000},
     ),
     # A memory that is not the checkpoint's has its own defaults.
-    (SMALL, {"policy.memory_stride": 8, "policy.memory_repeats": False}),
-    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8, "policy.memory_repeats": False}),
+    (SMALL, {"policy.memory_stride": 8}),
+    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8}),
     ([*SMALL, "policy.memory=motion", "policy.memory_stride=2"], {"policy.memory_stride": 2}),
-    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False, "policy.memory_repeats": True}),
+    ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False}),
 ]
 
 
@@ -391,13 +382,13 @@ def test_a_training_is_resumed_by_its_folder(training: Called, capsys: pytest.Ca
     for words in (again, [*again, *free], ["train", "output_dir=run", "--resume"]):
         training.flags = None
         assert main(words) == 0
-        assert (training.config_path, training.value("resume")) == (LAST_CONFIG, True)
+        assert (training.value("checkpoint_path"), training.value("resume")) == (Path("run/checkpoints/last"), True)
         assert training.value("policy.size") == "tiny"
     assert capsys.readouterr().err == ""
     for stated in ("run/checkpoints/000040/pretrained_model/train_config.json", "somebody/repository"):
         for resume in ("resume=true", "--resume=True"):
             given = parse_words([f"config_path={stated}", resume])
-            assert resumed(given) == given  # LeRobot's own form
+            assert with_last_checkpoint(given) == given  # LeRobot's own form
 
 
 @pytest.mark.parametrize("last", ["000040\n", None])
@@ -416,7 +407,7 @@ def test_a_copied_run_has_no_link(training: Called, last: str | None, lost: str 
         for text in ("run", "run/checkpoints/last", "run/checkpoints/last/pretrained_model"):
             assert checkpoint_folder(text) == found
     assert main(RESUME) == 0
-    assert training.config_path == str(found / "train_config.json")
+    assert training.value("checkpoint_path") == found.parent
     assert not link.exists(), "LeRobot makes it"
 
 

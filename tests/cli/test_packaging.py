@@ -15,8 +15,7 @@ import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 
-from lerobot_memobench.sim.rendering import QUALITIES
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, QUALITIES, Simulation
 from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]

@@ -19,11 +19,11 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.html.write import UNFINISHED
+from lerobot_memobench.evaluation.html import UNFINISHED
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.run.card import new_card, run_facts, write_card
 from tests.support import logs, synthetic_dataset
 from tests.support.fake_loop import STOVE
 from tests.support.fork_server import Fork, ForkServer
@@ -110,9 +110,7 @@ def test_a_second_writer_changes_nothing(
     for name in ("out/notes.json", "out/.1-a.part.evaluation.json", "run/model", "files/a.hdf5"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")
-    parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
-    started = [run_facts(["lerobot", "eval"], 1)]
-    write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, settings={}, runs=started))
+    write_evaluation(Path("out"), logs.card({"tasks": [STOVE], "episodes": 2}))
     for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", "data"):
         Path(name).mkdir(parents=True)
     Path("html/index.html").write_text(UNFINISHED)
@@ -121,7 +119,7 @@ def test_a_second_writer_changes_nothing(
     for path in dataset.iterdir():
         Path("data", path.name).symlink_to(path)
     Path(".run.lock").touch()
-    EpisodeLog("logged").append(logs.record(STOVE))
+    logs.write_log(Path("logged"), [logs.record(STOVE)])
 
     def files() -> dict[Path, bytes | None]:
         return {path: path.read_bytes() if path.is_file() else None for path in tmp_path.rglob("*")}

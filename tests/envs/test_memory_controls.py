@@ -10,12 +10,13 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.env import MemobenchEnv
-from lerobot_memobench.envs.episode_log import differences, read_episodes
-from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import differences, read_evaluation
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EXECUTION, PROMPT
+from tests.support.logs import protocol_of
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"

@@ -23,7 +23,7 @@ from lerobot_memobench.envs import episode as episodes
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import report_values, summarise
+from lerobot_memobench.evaluation.metrics import report_values, summary_of
 from lerobot_memobench.protocol import EXECUTION, NO_CLOCK
 from lerobot_memobench.vla_eval import MEMOBench
 from tests.support.remote_case import free_port
@@ -102,7 +102,7 @@ def test_harness_and_lerobot_run_the_same_episodes(tmp_path: Path, monkeypatch: 
     assert sorted(len(obs.get("video_history", ())) for _, _, obs in heard) == [0, 0, 3, 3]
     assert len(server.heard) == len(heard) == 4
     assert log_of(tmp_path / "log") == log_of(tmp_path / "run")
-    values = report_values(summarise(read_episodes(tmp_path / "log")))
+    values = report_values(summary_of(read_episodes(tmp_path / "log")))
     (task,) = result["tasks"]
     row = values["tasks"][task["task"]]
     assert row["n"] == task["num_episodes"] == 2
@@ -191,7 +191,7 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"history_every": 0}, "history_every"),
         ({"seed": 100_007}, "test-sealed"),
         ({"obs_type": "both"}, "send_state"),
-        ({"mirror": True}, "convention to libero"),
+        ({"mirror": True}, "'mirror'"),
         ({"evidence": True}, "referent"),
         ({"suite": "strict"}, "set replan_steps"),
         ({"n_action_steps": 4, "replan_steps": 6}, "multiple of n_action_steps=4"),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from tests.support.short_demonstrations import drawn_steps, with_pictures
 
 TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"

@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import episode_record, write_episodes
+from lerobot_memobench.envs.episode_log import episode_record, read_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import outcome
 from lerobot_memobench.evaluation.headline import protocol_phrases
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.run.card import first_variant_mismatch
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DIFFICULTIES, STANDARD, STRICT, Difficulty
+from tests.support.logs import facts
+from tools.board.check import first_variant_mismatch
 
 STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 
@@ -80,9 +81,10 @@ def test_a_log_of_a_difficulty_is_checked_and_described_as_such(tmp_path: Path) 
             episode.step(np.zeros(ACTION_DIM))
         lines.append(episode_record(episode, number, 0.1))
     assert max(line["variant"] for line in lines) > 2
-    assert first_variant_mismatch(lines) is None
-    assert first_variant_mismatch(map(outcome, lines)) is None
-    assert "variant" in str(first_variant_mismatch([line | {"difficulty": STANDARD} for line in lines]))
+    write_evaluation(tmp_path, facts(settings.protocol_block | {"seed_base": 20_000}))
     write_episodes(tmp_path, lines)
+    records = read_log(tmp_path)
+    assert first_variant_mismatch(records) is None
+    assert "variant" in str(first_variant_mismatch([record | {"difficulty": STANDARD} for record in records]))
     (run,) = read_runs([tmp_path])
     assert "difficulty hard" in protocol_phrases(run)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, LOG, About, Evaluation, row_name
-from lerobot_memobench.envs.episode_log import EpisodeRecord, key_of
+from lerobot_memobench.envs.episode_log import EpisodeRecord, joined, key_of
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Malformed, checked, in_words, parsed
@@ -77,37 +77,37 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Submitted:
     card = read_evaluation(folder / CARD, whole=True)
     content = _unpacked(folder / LOG)
     json.loads((folder / CARD).read_bytes(), object_pairs_hook=_once)
-    return Submitted(folder, card, list(_records(folder / LOG, content)), hashlib.sha256(content).hexdigest())
+    records = joined(folder, card, _lines(folder / LOG, content))
+    return Submitted(folder, card, records, hashlib.sha256(content).hexdigest())
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object; raise for a key given twice, because readers differ in the value that counts."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise MemobenchError(f"card or log has a key twice in {str(found)[:80]}; submit them unchanged")
-    return found
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        raise MemobenchError(f"card or log has a key twice in {str(content)[:80]}; submit them unchanged")
+    return content
 
 
 def _check_entries(folder: Path, folders: Sequence[str]) -> None:
-    """Refuse unknown names, links, missing and large files."""
     if not stat.S_ISDIR(folder.lstat().st_mode):
         raise MemobenchError(f"{folder} is not a folder; expected one with {CARD} and {LOG}")
     entries = sorted(folder.iterdir())
     for entry in entries:
-        found = entry.lstat()
+        status = entry.lstat()
         if entry.name not in (*LARGEST, *folders):
             raise MemobenchError(
                 f"{folder} holds {entry.name[:80]!r}; expected {CARD} and {LOG} only, and folders "
                 f"{' and '.join(CONTROLS)} of a row"
             )
         if entry.name in folders:
-            if not stat.S_ISDIR(found.st_mode):
+            if not stat.S_ISDIR(status.st_mode):
                 raise MemobenchError(f"{entry} is a link or a file; expected a folder")
-        elif not stat.S_ISREG(found.st_mode):
+        elif not stat.S_ISREG(status.st_mode):
             raise MemobenchError(f"{entry} is a link or no plain file; expected a file")
-        elif found.st_size > LARGEST[entry.name]:
+        elif status.st_size > LARGEST[entry.name]:
             raise MemobenchError(
-                f"{entry} has {in_words(found.st_size)}; expected at most {in_words(LARGEST[entry.name])}"
+                f"{entry} has {in_words(status.st_size)}; expected at most {in_words(LARGEST[entry.name])}"
             )
     if missing := [name for name in LARGEST if name not in {entry.name for entry in entries}]:
         raise MemobenchError(f"{folder} lacks {' and '.join(missing)}; `memobench submit` writes both")
@@ -126,7 +126,7 @@ def _unpacked(file: Path) -> bytes:
     return content
 
 
-def _records(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
+def _lines(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
     known = set()
     for number, line in enumerate(content.splitlines(), start=1):
         try:

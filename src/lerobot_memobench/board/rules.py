@@ -14,11 +14,10 @@ from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import PAUSES, Evaluation
-from lerobot_memobench.datasets.generation import task_hash
-from lerobot_memobench.envs.episode_log import POLICY, differences
+from lerobot_memobench.datasets.generate import task_hash
+from lerobot_memobench.envs.evaluation_file import POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreements
 from lerobot_memobench.protocol import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
 from lerobot_memobench.run.card import PACKAGES
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -35,13 +34,13 @@ MAY_DIFFER = {
 """Settings of the protocol that a submission may choose; all others have their defaults."""
 CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
 REQUIRED = {
-    found.name: found.specifier for found in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not found.marker
+    each.name: each.specifier for each in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not each.marker
 }
 """Package -> its versions under which this package runs."""
 
 
 def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") -> None:
-    """Check an evaluation: settings, episodes, seeds, versions, agreement of card and log.
+    """Check an evaluation: settings, episodes, seeds, versions.
 
     Args:
         part: whether any tasks of the suite, and any number of their episodes, are enough.
@@ -54,8 +53,6 @@ def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") 
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
     _check_extent(run, names, 1 if part else FEWEST)
     _check_versions(run, names)
-    if found := disagreements(run.card["episodes"], run.records):
-        raise MemobenchError(f"{run.place}: card and log disagree: {found[0]}; submit both unchanged")
     _check_salt(run)
 
 
@@ -70,12 +67,11 @@ def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool
         mine, other = (each.card[POLICY].get(key) for each in (run, control))
         if mine != other:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
-    if found := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
-        raise MemobenchError(f"{run.place} and {control.place} differ in {found[0]}; evaluate with the same settings")
+    if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
+        raise MemobenchError(f"{run.place} and {control.place} differ in {unlike[0]}; evaluate with the same settings")
 
 
 def _check_settings(run: Evaluation, **control: Any) -> None:
-    """Check that the settings are those of the board, and of a control."""
     protocol = run.protocol
     if protocol["suite"] not in (PUBLISHED, STRICT):
         raise MemobenchError(
@@ -90,8 +86,8 @@ def _check_settings(run: Evaluation, **control: Any) -> None:
         raise MemobenchError(
             f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
-    if found := differences(protocol, fixed, ignore=MAY_DIFFER):
-        raise MemobenchError(f"{run.place}: {found[0]} on the board; evaluate with the value of the board")
+    if unlike := differences(protocol, fixed, ignore=MAY_DIFFER):
+        raise MemobenchError(f"{run.place}: {unlike[0]} on the board; evaluate with the value of the board")
 
 
 def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
@@ -121,7 +117,6 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
 
 
 def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
-    """Check that one version ran all parts, with the task files of this version."""
     for package in PACKAGES[:3]:
         versions = {start["versions"].get(package) for start in run.card["runs"]}
         if len(versions) > 1:
@@ -148,7 +143,6 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
 
 
 def _check_salt(run: Evaluation) -> None:
-    """Check that an evaluation on the sealed seeds, and no other, has a salt."""
     if (SEEDS[run.protocol["seed_base"]] == SEALED) != bool(run.protocol["salt"]):
         raise MemobenchError(
             f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "

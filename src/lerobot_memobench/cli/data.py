@@ -19,7 +19,7 @@ from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.validate import Verdict
+    from lerobot_memobench.datasets.validate import CheckResult
     from lerobot_memobench.jobs.processes import Advance
 
 
@@ -64,8 +64,8 @@ def generate(
         )
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import episodes_of
-    from lerobot_memobench.datasets.generation import generate as run
+    from lerobot_memobench.datasets.generate import episodes_of
+    from lerobot_memobench.datasets.generate import generate as run
 
     screen = console()
     total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
@@ -94,15 +94,17 @@ def generate(
             **named,
         )
     rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
-    for task in summary.tasks:
-        mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
-        rows.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
+    for name in summary.tasks:
+        of_task = [episode for episode in summary.episodes if episode.task_name == name]
+        frames = [episode.frames for episode in of_task if episode.failure is None]
+        mean = f"{sum(frames) / len(frames):.0f}" if frames else "–"
+        rows.add_row(name, str(len(frames)), str(len(of_task)), str(sum(frames)), mean)
     console().print(Unbroken(rows), crop=False)
-    for failure in summary.failures:
-        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
+    for episode in summary.failures:
+        say(f"no demonstration of {episode.task_name}, seed {episode.seed}: {episode.failure}")
     written = f"dataset: {summary.folder}"
     say("no dataset was written: no seed was solved" if summary.folder is None else written)
-    return summary.exit_status
+    return 1 if summary.failures else 0
 
 
 def convert(
@@ -209,15 +211,15 @@ def view(
     ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
-    from lerobot_memobench.datasets.lerobot_format.tables import read_info
-    from lerobot_memobench.training.view import choice_for, write_view
+    from lerobot_memobench.datasets.episodes import read_info
+    from lerobot_memobench.training.view import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
     if convention is not None:
         check_choice("convention", convention, [*CONVENTIONS])
-    choice = choice_for(None, read_info(dataset)["features"], prompts, obs_type)
-    write_view(dataset, out, replace(choice, convention=convention))
+    options = view_options(None, read_info(dataset)["features"], prompts, obs_type)
+    write_view(dataset, out, replace(options, convention=convention))
     say(f"view: {out}")
 
 
@@ -230,25 +232,24 @@ def validate(
 
     The first disagreement of each is reported, and files that were written again.
     """
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
-    from lerobot_memobench.datasets.validate import exit_status
+    from lerobot_memobench.datasets.episodes import check_suite_of
     from lerobot_memobench.datasets.validate import validate as run
 
     if suite is not None:
         check_suite_of(folder, suite)
     with counting(console(), "episodes") as count:
 
-        def advance(done: int, total: int, verdict: Verdict) -> None:
-            count(done, total, verdict.subject, trouble=verdict.disagreement)
+        def advance(done: int, total: int, result: CheckResult) -> None:
+            count(done, total, result.subject, trouble=result.disagreement)
 
-        verdicts = run(folder, workers=workers, progress=advance)
-    for verdict in verdicts:
-        if verdict.note is not None:
-            say(f"note: {verdict.subject}: {verdict.note}")
-    episodes, files = ([each for each in verdicts if each.of_file == of_file] for of_file in (False, True))
-    agree, damaged = (sum(each.disagreement is None for each in episodes), exit_status(files))
-    say(f"{agree} of {len(episodes)} episodes agree" + damaged * ", and files of the dataset do not (above)")
-    return exit_status(verdicts)
+        results = run(folder, workers=workers, progress=advance)
+    for result in results:
+        if result.note is not None:
+            say(f"note: {result.subject}: {result.note}")
+    episodes, files = ([each.disagreement for each in results if each.of_file == of_file] for of_file in (False, True))
+    damaged = ", and files of the dataset do not (above)" if any(files) else ""
+    say(f"{episodes.count(None)} of {len(episodes)} episodes agree{damaged}")
+    return 1 if any(episodes) or any(files) else 0
 
 
 def push(
@@ -259,7 +260,7 @@ def push(
     """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
     continues a broken upload. Files of an earlier dataset there are deleted.
     """
-    from lerobot_memobench.datasets.publish import push as run
+    from lerobot_memobench.datasets.card import push as run
 
     say(f"dataset: {run(folder, repo_id, private=private, notify=say)}")
     return 0
@@ -271,8 +272,8 @@ def describe(
     suite: OfSuite = None,
 ) -> int:
     """Summarise a dataset. The card's tables and the hash of every episode, small enough to commit."""
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
-    from lerobot_memobench.datasets.publish import describe as run
+    from lerobot_memobench.datasets.card import describe as run
+    from lerobot_memobench.datasets.episodes import check_suite_of
 
     if suite is not None:
         check_suite_of(folder, suite)

@@ -84,9 +84,9 @@ def run(line: Sequence[str]) -> int:
         raise MemobenchError("found python -OO or PYTHONOPTIMIZE=2, and transformers reads docstrings; use -O or 1")
     check_names(name, words)
     if name == "train":
-        from lerobot_memobench.training.command import train
+        from lerobot_memobench.training.command import run_training
 
-        return train(words, note)
+        return run_training(words, note)
     use_threads(ACTING)  # before torch is imported
     if is_of_benchmark(words) and HELP not in words:
         return evaluate(words)
@@ -136,7 +136,7 @@ def evaluate_suites(suites: Sequence[str], words: Mapping[str, str]) -> int:
     """Run an evaluation of each of several suites of LIBERO, in a folder of its name; return the highest status."""
     from lerobot_memobench.envs.episode_log import has_log
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report_tables import memory_types_table
+    from lerobot_memobench.evaluation.report import memory_types_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
     named = words.get("output_dir")
@@ -223,8 +223,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
     from lerobot_memobench.evaluation.headline import headline
-    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN
-    from lerobot_memobench.evaluation.report_tables import failure_line, rates_table
+    from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, failure_line, rates_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
     screen = console()

@@ -167,13 +167,12 @@ def assets(
     """Find LIBERO's assets, of which the scenes are made. They are downloaded from the Hugging Face hub if this machine
     has no complete copy.
     """
-    from lerobot_memobench.sim.libero import fetch
-    from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, TERMS
+    from lerobot_memobench.sim.files import ASSETS_VARIABLE, TERMS, copy_to, obtain
 
-    place = fetch.obtain()
+    place = obtain()
     say(f"LIBERO's assets: {place.folder}, from {place.source}. {TERMS}.")
     if to is not None:
-        say(f"copied {in_words(fetch.copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
+        say(f"copied {in_words(copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
 
 
 # --- train ---
@@ -208,7 +207,7 @@ def conformance(
     """Check the memory of a policy. Rows are independent, reset forgets, the prompt reaches the memory, training has
     the history of a rollout, and more. Status 1 where a check fails.
     """
-    from lerobot_memobench.conformance.checks import Outcome, run_checks
+    from lerobot_memobench.conformance.checks import FAILED, run_checks
     from lerobot_memobench.conformance.subject import load_subject
 
     with tempfile.TemporaryDirectory() as folder:
@@ -218,7 +217,7 @@ def conformance(
     for result in results:
         rows.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
     console().print(rows)
-    failed = [result.check for result in results if result.outcome is Outcome.FAILED]
+    failed = [result.check for result in results if result.outcome is FAILED]
     say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
     return 1 if failed else 0
 

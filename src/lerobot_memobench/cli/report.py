@@ -55,20 +55,20 @@ def report(
     report.json and report.md are also written to the folder of each evaluation, unless its log is compressed.
     """
     from lerobot_memobench.evaluation.records import read_runs
-    from lerobot_memobench.evaluation.report import build
+    from lerobot_memobench.evaluation.report import evaluation_report
 
     runs = read_runs(folders)
     for run in runs:
         for each in run.evaluations:
             _write_next_to_log(each)
-    show_report(build(runs), "report", format_, out)
+    show_report(evaluation_report(runs), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
 
         for path in draw_figures(runs, figures):
             say(path)
     if html is not None:
-        from lerobot_memobench.evaluation.html.write import write_html
+        from lerobot_memobench.evaluation.html import write_html
 
         written = write_html(folders, html, task_dir)
         for line in written.notes:
@@ -109,12 +109,11 @@ def compare(
 
     Evaluations that differ in the setting of a control (pauses, corrupted memory, interference, …) are reported as it.
     """
-    from lerobot_memobench.evaluation.comparison import compare as compared
-    from lerobot_memobench.evaluation.comparison import comparison_csv, comparison_report
+    from lerobot_memobench.evaluation.comparison import compare_evaluations, comparison_csv, comparison_report
     from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
-    found = compared(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    found = compare_evaluations(first, second, allow=allow or (), seed=seed, permutations=permutations)
     show_report(comparison_report(found), "compare", format_, out, comparison_csv(found))
 
 
@@ -173,7 +172,6 @@ def submit(
 
     It consists of a folder for results/board and the text of a pull request.
     """
-    from lerobot_memobench.board.pull_request import pull_request
     from lerobot_memobench.board.rules import check_control, check_evaluation
     from lerobot_memobench.board.submission import (
         BOARD,
@@ -182,6 +180,7 @@ def submit(
         About,
         RowName,
         own_evaluation,
+        pull_request,
         write_submission,
     )
 
@@ -221,16 +220,16 @@ def export(
     ] = None,
 ) -> None:
     """Export a result for the page of a model on the Hugging Face hub, .eval_results/memobench.yaml."""
-    from lerobot_memobench.evaluation.huggingface import FILE, huggingface_yaml
     from lerobot_memobench.evaluation.records import read_runs
+    from lerobot_memobench.evaluation.report import HUB_FILE, huggingface_yaml
 
     (run,) = read_runs([card])
     text = huggingface_yaml(run, dataset)
     if out is None:
         print(text, end="")
         return
-    (out / FILE).parent.mkdir(parents=True, exist_ok=True)
-    say(write_file(out / FILE, text))
+    (out / HUB_FILE).parent.mkdir(parents=True, exist_ok=True)
+    say(write_file(out / HUB_FILE, text))
 
 
 def show_report(

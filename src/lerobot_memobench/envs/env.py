@@ -17,16 +17,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
-    OMITTED,
-    UNKNOWN_POLICY,
-    Acting,
     EpisodeLog,
     episode_record,
     has_log,
     not_run_record,
-    read_log,
+    read_lines,
 )
-from lerobot_memobench.envs.evaluation_file import write_protocol
+from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, facts_of, write_facts
 from lerobot_memobench.envs.observations import (
     METADATA,
     REWARDS,
@@ -37,7 +34,7 @@ from lerobot_memobench.envs.observations import (
     observation_space,
 )
 from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, PICTURES, RESET, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS, EnvSettings
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
@@ -125,9 +122,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._acting = acting
         self._log_dir = Path(log_dir) if log_dir is not None else None
         self._log: EpisodeLog | None = None
-        if log_dir is not None:
-            protocol = settings.protocol_block | acting.protocol
-            self._log = EpisodeLog(log_dir, partial(write_protocol, Path(log_dir), protocol))
+        if self._log_dir is not None:
+            self._log = EpisodeLog(self._log_dir, partial(write_facts, self._log_dir, facts_of(settings, acting)))
         self._video: VideoRecorder | None = None
         self._observer = Observer(settings)
         self._others: Interference | None = None
@@ -307,13 +303,9 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._check_began("record")
         if self._not_run is None:
             seconds = time.monotonic() - self._started
-            found = episode_record(self.episode, self._number, seconds)
-        else:
-            variants = len(self._task.random_variants) if self.settings.evidence else None
-            referent = self.settings.referent
-            found = not_run_record(self._task, self._number, self._scene_seed, referent, self._not_run, variants)
-        pictures = {name: getattr(self.settings, name) for name in (*PICTURES, "camera_name_mapping")}
-        return found | self._acting.line | {name: one for name, one in pictures.items() if one != OMITTED[name]}
+            return episode_record(self.episode, self._number, seconds)
+        variants = len(self._task.random_variants) if self.settings.evidence else None
+        return not_run_record(self._task, self._number, self._scene_seed, self._not_run, variants)
 
     def _observation(self) -> dict[str, Any]:
         if self._not_run is not None:
@@ -458,15 +450,11 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
     def _records(self) -> dict[int, dict[str, Any]]:
-        """Return episode -> log line, for this environment's task and referent."""
+        """Return episode -> log line, for this environment's task."""
         if self._logged is None:
-            records = read_log(self._log_dir) if has_log(self._log_dir) else []
+            lines = read_lines(self._log_dir) if has_log(self._log_dir) else []
             name = self.get_wrapper_attr("task")
-            self._logged = {
-                record["episode"]: record
-                for record in records
-                if record["task"] == name and record.get("referent", "fixed") == self._settings.referent
-            }
+            self._logged = {line["episode"]: line for line in lines if line["task"] == name}
         return self._logged
 
 

@@ -16,9 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.expert import Expert, blind_routine
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     CAMERAS,
@@ -37,8 +36,13 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
+from lerobot_memobench.sim.simulation import (
+    InvalidActionError,
+    RenderSettings,
+    Simulation,
+    UnstablePhysicsError,
+    as_action,
+)
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS

@@ -23,8 +23,8 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
-from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, Acting, has_log
-from lerobot_memobench.envs.evaluation_file import check_protocol
+from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, check_facts, facts_of
 from lerobot_memobench.envs.observations import (
     METADATA,
     action_space,
@@ -269,7 +269,7 @@ class MemobenchEnvConfig(_WithSettings):
         from lerobot_memobench.envs.env import MemobenchEnv, SkipLogged
 
         settings = self.settings_for(policy)
-        check_protocol(log_dir, settings.protocol_block | by.protocol)  # fail before the first episode
+        check_facts(log_dir, facts_of(settings, by))  # fail before the first episode
 
         def opened(folder: Path, rows: int, use_async_envs: bool) -> gym.vector.VectorEnv:
             make: Callable[[], gym.Env[Any, Any]] = partial(

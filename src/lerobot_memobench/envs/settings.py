@@ -25,7 +25,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
-from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
 from lerobot_memobench.tasks.task import (
     DIFFICULTIES,
@@ -359,13 +359,13 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {WORLD: LIBERO, **agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
+        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
 
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
-SETTINGS = (WORLD, *(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED))
-"""Settings with an effect on rollouts, and the source of the scenes."""
+SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
+"""Settings with an effect on rollouts."""
 
 
 def revision(suite: str, difficulty: str) -> dict[str, int]:

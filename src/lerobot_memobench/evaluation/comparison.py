@@ -7,6 +7,7 @@ control (`controls`) are that control: the setting may differ, and the report ex
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
 from typing import Any, Literal, NamedTuple
@@ -14,27 +15,27 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
+from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.agreement import SCENES
-from lerobot_memobench.evaluation.controls import Control, control_between, gap_closed
+from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
+    PROCESS_METRICS,
     SUITE,
     Record,
     by_task,
+    inputs_phrase,
     operations,
     percent,
-    policy_inputs,
     prefix,
+    rollout_value,
     satisfied,
-    value_of,
     varies,
 )
-from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
+from lerobot_memobench.evaluation.records import SCENES, Run, other_draws, other_hashes, other_physics
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     PERMUTATIONS,
@@ -57,7 +58,7 @@ from lerobot_memobench.evaluation.tables import (
     Section,
     Table,
     csv_text,
-    figure,
+    percent_text,
     with_ids,
 )
 from lerobot_memobench.io import count_of
@@ -65,7 +66,7 @@ from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
 from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
-ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
+ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]
@@ -202,37 +203,35 @@ class Comparison:
     """Two evaluations over the episodes that both hold.
 
     Attributes:
-        a, b: their names.
-        pairs: number of episodes.
+        runs: both, with these episodes alone.
         notes: warnings for the reader.
-        inputs: name of an evaluation -> inputs of its policy.
-        headline: the report's first line.
         control: the control that they are, if any.
     """
 
-    a: str
-    b: str
-    pairs: int
-    contrasts: tuple[Contrast, ...]
-    notes: tuple[str, ...]
-    inputs: Mapping[str, str]
-    headline: str
+    runs: tuple[Run, Run]
+    contrasts: Sequence[Contrast]
+    notes: Sequence[str]
     control: Control | None = None
+
+    @property
+    def pairs(self) -> int:
+        """The number of common episodes."""
+        return len(self.runs[0].records)
+
+    @property
+    def inputs(self) -> dict[str, str]:
+        """Name of an evaluation -> inputs of its policy."""
+        return {run.name: inputs_phrase(run.records) for run in self.runs}
 
     @property
     def title(self) -> str:
         """The control, where it is one, and the names of both."""
-        names = f"{self.b} against {self.a}"
+        names = f"{self.runs[1].name} against {self.runs[0].name}"
         return f"{self.control.title}: {names}" if self.control else names
 
 
-def compare(
-    a: Run,
-    b: Run,
-    *,
-    allow: Collection[str] = (),
-    seed: int = 0,
-    permutations: int = PERMUTATIONS,
+def compare_evaluations(
+    a: Run, b: Run, *, allow: Collection[str] = (), seed: int = 0, permutations: int = PERMUTATIONS
 ) -> Comparison:
     """Compare two evaluations over the episodes that both hold.
 
@@ -248,28 +247,17 @@ def compare(
     if other_hashes(a.protocol, b.protocol):
         allowed.add(SCENES)
     pairs = _paired(a, b, allowed)
-    notes = tuple(_notes(a, b, pairs, control))
-    a, b = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
-    return Comparison(
-        a=a.name,
-        b=b.name,
-        pairs=len(pairs),
-        contrasts=tuple(_contrasts(pairs, control, np.random.default_rng(seed), permutations)),
-        notes=notes,
-        inputs={run.name: policy_inputs(run.records) for run in (a, b)},
-        headline=headline([a, b]),
-        control=control,
-    )
+    contrasts = _contrasts(pairs, control, np.random.default_rng(seed), permutations)
+    first, second = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
+    return Comparison((first, second), contrasts, _notes(a, b, pairs, control), control)
 
 
 def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
     """Yield the comparison of each two evaluations that differ only in the setting of a control."""
     for a, b in ordered(runs, 2):
-        try:
+        with suppress(MemobenchError):  # reversed, of two policies, or of other protocols: no control
             if control_between(a, b) is not None:
-                yield compare(a, b)
-        except MemobenchError:  # reversed, of two policies, or of other protocols: no control
-            continue
+                yield compare_evaluations(a, b)
 
 
 # --- tasks and scopes ---
@@ -283,8 +271,6 @@ class _Sample(NamedTuple):
 
 
 class _Task(NamedTuple):
-    """The pairs of one task; ``samples`` has the metrics that apply to it."""
-
     name: str
     memory_type: str
     family: str | None
@@ -297,7 +283,9 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     tasks = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
-        values = {metric: np.array([[value_of(r, metric) for r in pair] for pair in both], float) for metric in METRICS}
+        values = {
+            metric: np.array([[rollout_value(r, metric) for r in pair] for pair in both], float) for metric in METRICS
+        }
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
@@ -352,7 +340,7 @@ def _contrasts(
         for metric in groups[0][0].samples if kind == "task" else METRICS:
             samples = [[task.samples[metric] for task in group if metric in task.samples] for group in groups]
             if applicable := [group for group in samples if group]:
-                contrasts.append(_contrast(kind, scope, metric, applicable, rng, permutations, closes))
+                contrasts.append(_contrast((kind, scope), metric, applicable, rng, permutations, closes))
     for metric in METRICS:
         of_tasks = [k for k, each in enumerate(contrasts) if each.metric == metric and each.kind == "task"]
         for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
@@ -361,15 +349,13 @@ def _contrasts(
 
 
 def _contrast(
-    kind: Kind,
-    scope: str,
+    scope: tuple[Kind, str],
     metric: str,
     groups: list[list[_Sample]],
     rng: np.random.Generator,
     permutations: int,
     closes: bool,
 ) -> Contrast:
-    """Return the contrast of one metric in one scope, weighted as the report weights."""
     values = [sample.values for group in groups for sample in group]
     sizes = [len(groups) * len(group) * len(sample.values) for group in groups for sample in group]
     before, after = np.concatenate(values).T
@@ -379,14 +365,13 @@ def _contrast(
     a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
     d = after - before
     only_a = only_b = None
-    if metric in METRICS[1:]:
+    if metric in PROCESS_METRICS:
         p, exact = sign_flip(d, weights, rng, permutations)
     else:
         only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
         p = mcnemar(only_a, only_b)
     return Contrast(
-        kind=kind,
-        scope=scope,
+        *scope,
         metric=metric,
         n=len(d),
         a=a,
@@ -407,8 +392,8 @@ def _mean(values: Sequence[float]) -> float:
 
 def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
     """Return the share of the gap that is closed, with its interval where the gap seldom vanishes in the draws."""
-    value = gap_closed(a, b)
-    shares = [share for pair in drawn.tolist() if (share := gap_closed(*pair)) is not None]
+    value = oracle_share(a, b)
+    shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
     if value is None or len(shares) <= 0.9 * len(drawn):
         return Estimate(value)
     least, most = (bound / (1.0 - a) for bound in bounds)
@@ -435,7 +420,7 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 def comparison_report(comparison: Comparison) -> Report:
     """Return a comparison as tables and JSON values."""
     section = comparison_section(comparison)
-    title = f"{section.title}: {comparison.headline}"
+    title = f"{section.title}: {headline(comparison.runs)}"
     return Report(title, [replace(section, title="")], comparison_data(comparison))
 
 
@@ -462,10 +447,10 @@ def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, 
     """
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
-        "a": comparison.a,
-        "b": comparison.b,
+        "a": comparison.runs[0].name,
+        "b": comparison.runs[1].name,
         "control": comparison.control.setting if comparison.control else None,
-        "inputs": dict(comparison.inputs),
+        "inputs": comparison.inputs,
         "pairs": comparison.pairs,
         "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
         "notes": list(comparison.notes),
@@ -484,14 +469,13 @@ def comparison_csv(comparison: Comparison) -> str:
 
 
 def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
-    """Return a row per metric; only the first of a scope names it."""
     rows = [row for row in comparison.contrasts if row.kind in kinds]
     of_tasks, closes = "task" in kinds, any(row.closed is not None for row in rows)
     columns: list[tuple[str, Callable[[Contrast], Cell]]] = [
         ("metric", lambda row: row.metric),
         ("pairs", lambda row: row.n),
-        (comparison.a, lambda row: _points(row.a)),
-        (comparison.b, lambda row: _points(row.b)),
+        (comparison.runs[0].name, lambda row: _points(row.a)),
+        (comparison.runs[1].name, lambda row: _points(row.b)),
         ("difference", lambda row: _points(row.value, True)),
         ("95 %", lambda row: Numbers(_interval(row))),
         ("only one", lambda row: Numbers("" if row.only_a is None else f"{row.only_a} / {row.only_b}")),
@@ -509,7 +493,7 @@ def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]
 
 
 def _points(value: float, signed: bool = False) -> Numbers:
-    return Numbers(figure(value, signed).replace("-", "−"))
+    return Numbers(percent_text(value, signed).replace("-", "−"))
 
 
 def _interval(row: Contrast) -> str:

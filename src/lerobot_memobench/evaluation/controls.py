@@ -1,25 +1,18 @@
-"""Controls: comparisons of two evaluations that differ in one setting on purpose, to test for memory.
+"""Controls: settings in which two evaluations differ on purpose, to test for memory.
 
-`CONTROLS` lists these settings; `comparison.compare` pairs, tests and reports a control like any two evaluations.
-Evidence needs only one evaluation (`evidence`). Granularity compares policies by the language level of the subgoals in
-their training.
+`comparison` pairs, tests and reports a control like any two evaluations. Evidence needs only one evaluation
+(`evidence`). Granularity compares policies by the language level of the subgoals in their training (`report`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Record, Summary, percent, summarise
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.evaluation.report_tables import AVERAGE
-from lerobot_memobench.evaluation.tables import Cell, Section, Table
-from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.task import LEVELS
 
 LEAST_GAP = 0.01
 """Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
@@ -30,7 +23,6 @@ class Control:
     """A setting in which two evaluations differ on purpose.
 
     Attributes:
-        title: name of the control.
         setting: key of the protocol, or of the policy's settings where ``of_policy``.
         default: its value in the first evaluation; the second has another.
         meaning: how to read the difference.
@@ -140,23 +132,18 @@ def control_between(a: Run, b: Run) -> Control | None:
                 f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
                 f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
             )
-        if control.one_policy:
-            _check_one_policy(a, b)
+        for key in ("type", "sha256") if control.one_policy else ():
+            mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
+            if mine and other and mine != other:
+                raise MemobenchError(
+                    f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
+                    "expected one policy with and without the control"
+                )
         return control
     return None
 
 
-def _check_one_policy(a: Run, b: Run) -> None:
-    for key in ("type", "sha256"):
-        mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
-        if mine and other and mine != other:
-            raise MemobenchError(
-                f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
-                "expected one policy with and without the control"
-            )
-
-
-def gap_closed(first: float | None, second: float | None) -> float | None:
+def oracle_share(first: float | None, second: float | None) -> float | None:
     """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
 
     It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
@@ -164,67 +151,3 @@ def gap_closed(first: float | None, second: float | None) -> float | None:
     if first is None or second is None or 1.0 - first < LEAST_GAP:
         return None
     return (second - first) / (1.0 - first)
-
-
-# --- annotation granularity ---
-
-
-def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
-    """Return name of an evaluation -> level of the subgoals taught to its policy, and rates under that level's labels.
-
-    It is empty unless the policies were taught with several levels.
-    """
-    levels = [(run, run.protocol[POLICY].get("settings", {}).get("subgoal_level")) for run in runs]
-    known = [(run, level) for run, level in levels if level in LEVELS]
-    if len({level for _, level in known}) < 2:
-        return {}
-    return {run.name: (level, summarise(with_labels_of(level, run.records))) for run, level in known}
-
-
-def granularity_section(runs: Sequence[Run]) -> list[Section]:
-    """Return the section of rates by subgoal level, [] unless the policies were taught with several levels."""
-    levels = granularity(runs)
-    if not levels:
-        return []
-    averages = {run.name: run.summary.average for run in runs}
-    rows: list[list[Cell]] = [
-        [name, level, *averages[name].values(), *(own.average[metric] for metric in PROCESS_METRICS)]
-        for name, (level, own) in levels.items()
-    ]
-    header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
-    sentence = (
-        f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
-        f"level: {AVERAGE}, per cent, with Wilson's 95 % interval over rollouts."
-    )
-    return [Section("Annotation granularity", [Table("granularity", "", header, rows)], [sentence])]
-
-
-def granularity_data(runs: Sequence[Run]) -> dict[str, Any]:
-    """Return the rates of `granularity` as JSON values, per cent."""
-    return {
-        name: {"level": level, "own_labels": {metric: percent(rate.value) for metric, rate in own.average.items()}}
-        for name, (level, own) in granularity(runs).items()
-    }
-
-
-def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
-    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs.
-
-    Raises:
-        MemobenchError: a rollout has another number of checkpoints than its task.
-    """
-    index = LEVELS.index(level)
-    result: list[Record] = []
-    for record in records:
-        if suite_of(record["task"]) is None:
-            result.append(record)
-            continue
-        labels = [checkpoint.operations_by_level[index] for checkpoint in get_task(record["task"]).checkpoints]
-        if len(labels) != len(record["checkpoints"]):
-            raise MemobenchError(
-                f"a rollout of {record['task']!r} has {len(record['checkpoints'])} checkpoints, its task has "
-                f"{len(labels)}; the log was written by another version of the task"
-            )
-        marks = zip(record["checkpoints"], labels, strict=True)
-        result.append({**record, "checkpoints": [{**mark, "operation": label} for mark, label in marks]})
-    return result

@@ -19,7 +19,7 @@ import numpy as np
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
 from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
-from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, figure, with_interval
+from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, percent_text, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DIFFICULTIES
@@ -129,12 +129,10 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
 
 
 def _by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Return the rollouts of tasks with several variants that record a choice, by task."""
     return by_task(record for record in records if "choice" in record and varies(record))
 
 
 def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
-    """Return the rollouts of each scene of a task that was run with every variant."""
     scenes: dict[int, dict[int, Record]] = {}
     for record in group:
         scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
@@ -231,7 +229,7 @@ def evidence_section(evidence: EvidenceRates) -> Section:
 def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:
     rates = [evidence.rates.get(name) for name in SHOWN]
     cells = [None if each is None else Numbers(with_interval(each.value, each.low, each.high)) for each in rates]
-    return (name, evidence.scenes, Numbers(figure(evidence.chance)), *cells, Numbers(f"{evidence.p:.2g}"))
+    return (name, evidence.scenes, Numbers(percent_text(evidence.chance)), *cells, Numbers(f"{evidence.p:.2g}"))
 
 
 def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[str, Any]:
@@ -267,5 +265,5 @@ def evidence_phrase(evidence: EvidenceRates) -> list[str]:
     """Return the average in words, for one line; [] where there is none."""
     if evidence.average is None:
         return []
-    follows = figure(evidence.average.rates["follows"].value)
-    return [f"follows the evidence {follows} %, chance {figure(evidence.average.chance)} %"]
+    follows = percent_text(evidence.average.rates["follows"].value)
+    return [f"follows the evidence {follows} %, chance {percent_text(evidence.average.chance)} %"]

@@ -11,14 +11,16 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
+from lerobot_memobench.envs.episode_log import seed_base
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
 from lerobot_memobench.tasks.libero_suites import libero_id
-from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, OPERATIONS, PUBLISHED, STRICT_FAILURES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
 """A rollout: one line of the episode log."""
@@ -57,13 +59,13 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     for record in records:
         grouped.setdefault(record["task"], []).append(record)
     for name, group in grouped.items():
-        for field, found in (
+        for field, values in (
             ("memory_type", {record["memory_type"] for record in group}),
             ("operations", {operations(record) for record in group}),
         ):
-            if len(found) > 1:
+            if len(values) > 1:
                 raise MemobenchError(
-                    f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(found))}); "
+                    f"rollouts of {name!r} disagree on their {field} ({', '.join(sorted(values))}); "
                     "report logs of different versions of a task separately"
                 )
         if group[0]["memory_type"] not in GROUPS:
@@ -76,26 +78,18 @@ def by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     return dict(sorted(grouped.items(), key=lambda item: (order[item[1][0]["memory_type"]], ids[item[0]], item[0])))
 
 
-# --- protocol of rollouts ---
+# --- notes on rollouts ---
 
 NOT_RECORDED = "not recorded"
 """Inputs of a policy whose log does not record them."""
 
 
-def policy_inputs(records: Iterable[Record]) -> str:
+def inputs_phrase(records: Iterable[Record]) -> str:
     """Return the inputs that rollouts record, and how many rollouts record none where others do."""
     known = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
     unknown = known.pop(NOT_RECORDED, 0)
-    parts = [
-        *sorted(known),
-        *([f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if known and unknown else []),
-    ]
-    return "; ".join(parts) or NOT_RECORDED
-
-
-def seed_base(record: Record) -> int:
-    """Return the seed of episode 0, computed from a rollout's own; a scene may be run with each of its variants."""
-    return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
+    rest = [f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if known and unknown else []
+    return "; ".join([*sorted(known), *rest]) or NOT_RECORDED
 
 
 def varies(record: Record) -> bool:
@@ -111,59 +105,38 @@ PROTOCOL: dict[str, Callable[[Record], Any]] = {
 }
 """Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
 
-OWNER = ("policy", "run")
-"""Fields of a record that name its policy."""
 
-
-def mixtures(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each part of the protocol in which rollouts differ."""
-    records = list(records)
-    notes = []
-    for words, value in PROTOCOL.items():
-        found = sorted({value(record) for record in records} - {None})
-        if len(found) > 1:
-            listed = ", ".join(map(str, found[:5])) + (", …" if len(found) > 5 else "")
-            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
-    known = [field for field in OWNER if any(record.get(field) for record in records)]
-    unnamed = sum(any(not record.get(field) for field in known) for record in records)
-    if unnamed:
-        of_policy = "names no policy" if unnamed == 1 else "name no policy"
-        notes.append(f"{count_of(unnamed, 'rollout')} of {len(records)} {of_policy}; the figures are over all of them.")
+def notes_on(records: Sequence[Record]) -> list[str]:
+    """Return notes for a reader of the rollouts' rates, a sentence each."""
+    notes = faults(records)
+    for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items():
+        notes.append(
+            f"{task}: the demonstration prompt did not show its scene in {count_of(len(group), 'rollout')}, the first "
+            f"in episode {group[0]['episode']}; no memory of it can solve the task"
+        )
+    notes += unsettled(records) + mixtures(records)
+    if missing := stand_ins_of(records):
+        notes.append(
+            f"this package's objects replaced the missing scans {', '.join(missing)}: figures with and without them do "
+            "not compare"
+        )
+    if any(record.get("referent") == "fixed" and suite_of(record["task"]) == PUBLISHED for record in records):
+        notes.append(
+            "a routine without a memory solves published goals with fixed referents; claims of memory need suite=strict"
+        )
     return notes
 
 
-def notes_on(records: Sequence[Record]) -> list[str]:
-    """Return notes for a reader of the rollouts' figures, a sentence each."""
-    scenes = unshown_prompts(records) + unsettled(records)
-    return faults(records) + scenes + mixtures(records) + missing_scans(records) + fixed_goals(records)
-
-
-def fixed_goals(records: Iterable[Record]) -> list[str]:
-    """Return a sentence where published goals had their fixed referents."""
-    fixed = any(record.get("referent") == "fixed" and suite_of(record["task"]) == PUBLISHED for record in records)
-    note = "a routine without a memory solves published goals with fixed referents; claims of memory need suite=strict"
-    return [note] if fixed else []
-
-
-def stand_ins_of(records: Iterable[Record]) -> list[str]:
-    """Return the classes whose missing scans this package's objects replaced in any of the rollouts."""
-    return sorted({name for record in records for name in record.get("stand_ins", ())})
-
-
-def missing_scans(records: Iterable[Record]) -> list[str]:
-    """Return a sentence where this package's objects replaced scans."""
-    missing = ", ".join(stand_ins_of(records))
-    note = f"this package's objects replaced the missing scans {missing}: figures with and without them do not compare"
-    return [note] if missing else []
-
-
-def unshown_prompts(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task whose demonstration prompts did not show their scene."""
-    return [
-        f"{task}: the demonstration prompt did not show its scene in {count_of(len(group), 'rollout')}, the first "
-        f"in episode {group[0]['episode']}; no memory of it can solve the task"
-        for task, group in by_task(record for record in records if record.get("prompt_shown") is False).items()
-    ]
+def faults(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each task with rollouts that were broken off, and so failed, with the first reason."""
+    notes = []
+    for task, group in by_task(record for record in records if record.get("fault")).items():
+        were, count = ("was", "counts") if len(group) == 1 else ("were", "count")
+        notes.append(
+            f"{task}: {count_of(len(group), 'rollout')} {were} broken off and {count} as failed, the first in episode "
+            f"{group[0]['episode']}: {group[0]['fault']}"
+        )
+    return notes
 
 
 def unsettled(records: Iterable[Record]) -> list[str]:
@@ -178,22 +151,24 @@ def unsettled(records: Iterable[Record]) -> list[str]:
     return [note] if counts else []
 
 
-def faults(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task with rollouts that were broken off, and so failed, with the first reason."""
-    return [
-        f"{task}: {count_of(len(group), 'rollout')} {'was' if len(group) == 1 else 'were'} broken off and "
-        f"{'counts' if len(group) == 1 else 'count'} as failed, the first in episode "
-        f"{group[0]['episode']}: {group[0]['fault']}"
-        for task, group in by_task(record for record in records if record.get("fault")).items()
-    ]
+def mixtures(records: Iterable[Record]) -> list[str]:
+    """Return a sentence for each part of the protocol in which rollouts differ."""
+    records = list(records)
+    notes = []
+    for words, value in PROTOCOL.items():
+        values = sorted({value(record) for record in records} - {None})
+        if len(values) > 1:
+            listed = ", ".join(map(str, values[:5])) + (", …" if len(values) > 5 else "")
+            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
+    return notes
+
+
+def stand_ins_of(records: Iterable[Record]) -> list[str]:
+    """Return the classes whose missing scans this package's objects replaced in any of the rollouts."""
+    return sorted({name for record in records for name in record.get("stand_ins", ())})
 
 
 # --- rates ---
-
-PROCESS_METRICS: dict[str, str] = {"MSR": "S", "MUR": "U", "MCR": "C"}
-"""Metric -> operation of the checkpoints it looks at."""
-
-METRICS = ("SR", *PROCESS_METRICS)
 
 Z95 = 1.959963984540054
 """Quantile of the normal distribution for two-sided 95 %."""
@@ -250,12 +225,63 @@ def percent(value: float | None) -> float | None:
     return None if value is None else round(100.0 * value, 1)
 
 
+# --- metrics ---
+
+
+class Metric(NamedTuple):
+    """A metric: the share of outcomes that are true; higher is better.
+
+    Attributes:
+        title: one word for the axis of a figure.
+        outcomes: rollout -> its outcomes, [] where the metric does not apply.
+    """
+
+    title: str
+    outcomes: Callable[[Record], list[bool]]
+
+
+def of_operation(operation: str, record: Record) -> list[bool]:
+    """Return per checkpoint of an operation whether it was satisfied."""
+    return [done for label, done in zip(operations(record), satisfied(record), strict=True) if label == operation]
+
+
+METRICS: dict[str, Metric] = {
+    "SR": Metric("success", lambda record: [bool(record["success"])]),
+    "MSR": Metric("storage", partial(of_operation, "S")),
+    "MUR": Metric("update", partial(of_operation, "U")),
+    "MCR": Metric("compression", partial(of_operation, "C")),
+}
+"""Name -> metric. These four are the paper's. Tables, JSON, comparisons and figures have a column for each."""
+PROCESS_METRICS = tuple(METRICS)[1:]
+"""Metrics of checkpoints, which LIBERO's suites do not have."""
+
+
 # --- rates of rollouts ---
 
 
-def success_rate(records: Sequence[Record]) -> Rate:
-    """Return the share of rollouts that succeeded."""
-    return Rate(sum(bool(record["success"]) for record in records) / len(records), len(records), _scenes(records))
+def task_row(records: Sequence[Record]) -> Row:
+    """Return the metrics of one task's rollouts: the mean over rollouts of the mean over a rollout's outcomes."""
+    pooled, scenes = pooled_row(records), _scenes(records)
+    return {metric: Rate(rate.value, len(records) if rate.n else 0, scenes) for metric, rate in pooled.items()}
+
+
+def pooled_row(records: Sequence[Record]) -> Row:
+    """Return the metrics over all outcomes of all rollouts; n counts outcomes, such as checkpoint records."""
+    outcomes = {
+        metric: [each for record in records for each in METRICS[metric].outcomes(record)]
+        for metric in _metrics(records)
+    }
+    return {metric: share(values) for metric, values in outcomes.items()}
+
+
+def rollout_value(record: Record, metric: str) -> float | None:
+    """Return a rollout's contribution to a metric: success, or the share of its operation's checkpoints satisfied."""
+    return share(METRICS[metric].outcomes(record)).value
+
+
+def share(values: Sequence[bool]) -> Rate:
+    """Return the share of values that are true."""
+    return Rate(sum(values) / len(values) if values else None, len(values))
 
 
 def _scenes(records: Sequence[Record]) -> int | None:
@@ -266,47 +292,14 @@ def _scenes(records: Sequence[Record]) -> int | None:
     return len({(record["task"], record.get("seed")) for record in records}) if any(map(varies, records)) else None
 
 
-def task_row(records: Sequence[Record]) -> Row:
-    """Return the metrics of one task's rollouts: the mean over rollouts of the mean over an operation's checkpoints."""
-    row = {"SR": success_rate(records)}
-    for metric, operation in _process_metrics(records).items():
-        found = checkpoint_rate(records, operation)
-        row[metric] = Rate(found.value, len(records) if found.n else 0, _scenes(records))
-    return row
+def _metrics(records: Sequence[Record]) -> Sequence[str]:
+    """Return the metrics of rollouts: SR alone of LIBERO's suites, which have no checkpoints."""
+    return ("SR",) if any(record.get("memory_type") in LIBERO_SUITES for record in records) else tuple(METRICS)
 
 
-def value_of(record: Record, metric: str) -> float | None:
-    """Return a rollout's contribution to a metric: success, or the share of its operation's checkpoints satisfied."""
-    if metric == "SR":
-        return float(bool(record["success"]))
-    return checkpoint_rate([record], PROCESS_METRICS[metric]).value
-
-
-def pooled_row(records: Sequence[Record]) -> Row:
-    """Return SR over all rollouts, and MSR, MUR, MCR over all checkpoint records of the operation."""
-    rates = {metric: checkpoint_rate(records, operation) for metric, operation in _process_metrics(records).items()}
-    return {"SR": success_rate(records), **rates}
-
-
-def _process_metrics(records: Sequence[Record]) -> dict[str, str]:
-    """Return `PROCESS_METRICS`, {} for tasks of LIBERO's suites."""
-    return {} if any(record.get("memory_type") in LIBERO_SUITES for record in records) else PROCESS_METRICS
-
-
-def checkpoint_rate(records: Iterable[Record], wanted: str) -> Rate:
-    """Return the share of the checkpoint records of some operations that were satisfied; n counts records."""
-    values = [
-        done
-        for record in records
-        for operation, done in zip(operations(record), satisfied(record), strict=True)
-        if operation in wanted
-    ]
-    return Rate(sum(values) / len(values) if values else None, len(values))
-
-
-def column_rates(rows: Sequence[Sequence[bool]]) -> list[Rate]:
-    """Return the share of (n, K) values that are true, (K,)."""
-    return [Rate(sum(column) / len(rows), len(rows)) for column in zip(*rows, strict=True)]
+def _prefix_rates(group: Sequence[Record], reached: Callable[[Record], list[bool]]) -> list[Rate]:
+    """Return per checkpoint the rate of rollouts in which it and all earlier ones were reached, (K,)."""
+    return [share(column) for column in zip(*(prefix(reached(record)) for record in group), strict=True)]
 
 
 # --- means of rates ---
@@ -374,11 +367,11 @@ def failure_counts(records: Iterable[Record]) -> dict[str, int]:
     Of LIBERO's suites, only those that are found.
     """
     records = list(records)
-    found, always = Counter(map(failure_of, records)), FAILURES if _process_metrics(records) else ()
-    return {name: found[name] for name in _ALL if name in always or found[name]}
+    counts, always = Counter(map(failure_of, records)), FAILURES if len(_metrics(records)) > 1 else ()
+    return {name: counts[name] for name in _ALL if name in always or counts[name]}
 
 
-# --- every figure of a set of rollouts ---
+# --- summary ---
 
 
 MEMORY_TYPE: Final = "memory type"
@@ -388,7 +381,7 @@ SUITE: Final = "suite"
 
 @dataclass(frozen=True)
 class Summary:
-    """All figures of a set of rollouts.
+    """All rates of a set of rollouts.
 
     Attributes:
         tasks: name -> metrics.
@@ -436,8 +429,8 @@ class Summary:
         return self.pooled["SR"].n
 
 
-def summarise(records: Iterable[Record]) -> Summary:
-    """Compute every figure of a set of rollouts."""
+def summary_of(records: Iterable[Record]) -> Summary:
+    """Compute all rates of a set of rollouts."""
     records = list(records)
     if not records:
         raise MemobenchError("there are no rollouts to report; run an evaluation first")
@@ -454,16 +447,14 @@ def summarise(records: Iterable[Record]) -> Summary:
         memory_types=memory_types,
         average=mean_row(memory_types.values()),
         pooled=pooled_row(records),
-        pooled_checkpoints=checkpoint_rate(records, "".join(OPERATIONS)),
-        prefix={name: column_rates([prefix(satisfied(r)) for r in group]) for name, group in groups.items()},
-        ordered_prefix={
-            name: column_rates([prefix(completed_in_order(r)) for r in group]) for name, group in groups.items()
-        },
+        pooled_checkpoints=share([done for record in records for done in satisfied(record)]),
+        prefix={name: _prefix_rates(group, satisfied) for name, group in groups.items()},
+        ordered_prefix={name: _prefix_rates(group, completed_in_order) for name, group in groups.items()},
         failures=failure_counts(records),
         failures_of={name: failure_counts(group) for name, group in groups.items()},
         memory_type_of=memory_type_of,
         operations_of={name: operations(group[0]) for name, group in groups.items()},
-        inputs=policy_inputs(records),
+        inputs=inputs_phrase(records),
     )
 
 

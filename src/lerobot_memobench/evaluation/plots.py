@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from lerobot_memobench.envs.video import OPERATION_COLOURS as VIDEO_COLOURS
-from lerobot_memobench.evaluation.metrics import Rate, Record
+from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import Run, sweeps
-from lerobot_memobench.evaluation.report_tables import outcomes
+from lerobot_memobench.evaluation.report import outcomes
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.tasks.catalogue import get_task, suite_of
 from lerobot_memobench.tasks.gap import gaps
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 OPERATION_COLOURS = {key: "#" + bytes(colour).hex() for key, colour in VIDEO_COLOURS.items()}
-METRIC_NAMES = {"SR": "success", "MSR": "storage", "MUR": "update", "MCR": "compression"}
 INK, FAINT, GRID = "#222222", "#777777", "#d9d9d9"
 
 OUTCOMES = {
@@ -156,16 +155,12 @@ class Bar(NamedTuple):
 
 def bars(runs: Sequence[Run]) -> list[Bar]:
     """Return the bars of all rollouts, then of each memory type."""
-    groups: dict[str, dict[str, list[str]]] = {}  # heading -> name of the evaluation -> tasks
-    for run in runs:
-        for task, memory_type in run.summary.memory_type_of.items():
-            for heading in ("all rollouts", memory_type):
-                groups.setdefault(heading, {}).setdefault(run.name, []).append(task)
-    summaries = {run.name: run.summary for run in runs}
+    types = dict.fromkeys(memory_type for run in runs for memory_type in run.summary.memory_type_of.values())
     return [
-        Bar(heading, name if len(runs) > 1 else "", outcomes(summaries[name], tasks))
-        for heading, members in groups.items()
-        for name, tasks in members.items()
+        Bar(heading, run.name if len(runs) > 1 else "", outcomes(run.summary, tasks))
+        for heading in ("all rollouts", *types)
+        for run in runs
+        if (tasks := [task for task, kind in run.summary.memory_type_of.items() if heading in ("all rollouts", kind)])
     ]
 
 
@@ -228,7 +223,7 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
         for metric, axis in zip(metrics, figure.subplots(1, len(metrics), squeeze=False)[0], strict=True):
             for name, curves in methods.items():
                 _draw_curve(axis, curves[metric], styles[name])
-            axis.set_title(f"{metric} ({METRIC_NAMES[metric]})", fontsize=7.5)
+            axis.set_title(f"{metric} ({METRICS[metric].title})", fontsize=7.5)
             axis.set_xlabel("replan interval, steps")
             axis.set_xticks(sorted({steps for curves in methods.values() for steps in curves[metric]}))
             # Room for markers at the top, and at least ten points of scale: noise is not to look like a trend.
@@ -241,7 +236,6 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
 
 
 def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
-    """Return metric -> its average at each replan interval where it applies."""
     return {
         metric: {
             run.replan_steps: rate
@@ -253,7 +247,6 @@ def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
 
 
 def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) -> None:
-    """Draw rates over a replan interval, or another abscissa."""
     values = [math.nan if rate.value is None else 100 * rate.value for rate in curve.values()]
     intervals = [rate.interval for rate in curve.values() if rate.interval is not None]
     if intervals:

@@ -133,7 +133,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and its 95 % interval; None where it does not apply."""
+    """An estimate and its 95 % interval; None where it does not apply."""
 
     value: float | None
     low: float | None = None

@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import NamedTuple
 
 from rich import box
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
 from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -31,7 +31,7 @@ class Name(str):
 
 
 class Numbers(str):
-    """Figures written out; set flush right like figures."""
+    """Numbers written out; set flush right."""
 
 
 class PrefixRates(NamedTuple):
@@ -50,8 +50,8 @@ class Table:
     """A table and its note.
 
     Attributes:
-        key: short name, unique in a report. header: names of the columns.
-        rows: each as long as the header. note: how to read it.
+        key: short name, unique in a report.
+        rows: each as long as the header.
         groups: (title, columns) over the header, from the left; "" for none.
         strong: rows that sum up, by index. rules: rows before which a line is drawn.
         best: (row, column) of the cells to be marked as best.
@@ -87,11 +87,11 @@ class Table:
     def text(self, cell: Cell, interval: str = " [{}–{}]", escape: Callable[[str], str] = str) -> str:
         """Return a cell as text; ``interval`` is the format of an interval."""
         if isinstance(cell, PrefixRates):
-            return escape(" / ".join(figure(rate.value) for rate in cell))
+            return escape(" / ".join(percent_text(rate.value) for rate in cell))
         if not isinstance(cell, Rate):
             return escape(NOT_APPLICABLE if cell is None else str(cell))
         bounds = cell.interval if self.intervals else None
-        return escape(figure(cell.value)) + (interval.format(*map(figure, bounds)) if bounds else "")
+        return escape(percent_text(cell.value)) + (interval.format(*map(percent_text, bounds)) if bounds else "")
 
     def is_text(self, column: int) -> bool:
         """Return whether a column holds text and is therefore set flush left."""
@@ -110,7 +110,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """A report: sections, and the same figures as JSON values."""
+    """A report: sections, and the same values as JSON."""
 
     title: str
     sections: Sequence[Section]
@@ -122,14 +122,14 @@ class Report:
         return [table for section in self.sections for table in section.tables]
 
 
-def figure(value: float | None, sign: bool = False) -> str:
+def percent_text(value: float | None, sign: bool = False) -> str:
     """Return a fraction as a percentage with one decimal."""
     return NOT_APPLICABLE if value is None else f"{percent(value):{'+' if sign else ''}.1f}"
 
 
 def with_interval(value: float | None, low: float | None, high: float | None) -> str:
     """Return a fraction and its interval as percentages: ``97.8 [95.2–99.0]``."""
-    return f"{figure(value)} [{figure(low)}–{figure(high)}]"
+    return f"{percent_text(value)} [{percent_text(low)}–{percent_text(high)}]"
 
 
 def with_ids(table: Table) -> Table:
@@ -160,7 +160,7 @@ def best_in_columns(rows: Sequence[Sequence[Cell]]) -> set[tuple[int, int]]:
 # --- GitHub's Markdown ---
 
 
-def markdown(report: Report) -> str:
+def to_markdown(report: Report) -> str:
     """Return a report as GitHub's Markdown."""
     lines = [f"# {markdown_text(report.title)}", ""]
     for section in report.sections:
@@ -207,34 +207,12 @@ def _paragraph(words: str) -> str:
 
 # --- LaTeX in the style of booktabs ---
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "$": r"\$",
-    "&": r"\&",
-    "#": r"\#",
-    "%": r"\%",
-    "_": r"\_",
-    "^": r"\textasciicircum{}",
-    "~": r"\textasciitilde{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-    "[": "{[}",  # after the end of a row it would be taken as an option, as would a star
-    "*": "{*}",
-    "–": "--",
-    "κ": r"$\kappa$",
-    "π": r"$\pi$",
-    "−": r"$-$",
-    "×": r"$\times$",
-    "±": r"$\pm$",
-    "≥": r"$\geq$",
-    "≤": r"$\leq$",
-    "…": r"\ldots{}",
-    "→": r"$\rightarrow$",
-    "’": "'",
+_LATEX = {character: rf"\{character}" for character in "{}$&#%_"} | {
+    **{"\\": r"\textbackslash{}", "^": r"\textasciicircum{}", "~": r"\textasciitilde{}", "|": r"\textbar{}"},
+    **{"<": r"\textless{}", ">": r"\textgreater{}", '"': r"\textquotedbl{}", "…": r"\ldots{}"},
+    **{"[": "{[}", "*": "{*}"},  # after the end of a row they would be taken as an option
+    **{"–": "--", "’": "'", "κ": r"$\kappa$", "π": r"$\pi$", "−": r"$-$", "×": r"$\times$", "±": r"$\pm$"},
+    **{"≥": r"$\geq$", "≤": r"$\leq$", "→": r"$\rightarrow$"},
 }
 
 
@@ -245,7 +223,7 @@ def latex_text(words: str) -> str:
     return re.sub("\0(.*?)\0", r"$\\pi_{\1}$", escaped)
 
 
-def latex(report: Report) -> str:
+def to_latex(report: Report) -> str:
     """Return the report's tables as LaTeX, to be read by ``\\input``; the head names the packages they need."""
     lines = [
         f"% {' '.join(report.title.split())}, written by `memobench report`.",
@@ -266,6 +244,15 @@ def latex(report: Report) -> str:
 def latex_table(table: Table) -> list[str]:
     """Return the lines of a table in the style of booktabs."""
     columns = "".join("l" if table.is_text(column) else "r" for column in range(len(table.header)))
+    rows = []
+    for index, row in enumerate(table.rows):
+        cells = []
+        for column, cell in enumerate(row):
+            words = table.text(cell, r" {{\scriptsize [{}, {}]}}", latex_text)
+            words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
+            strong = index in table.strong or (index, column) in table.best
+            cells.append(rf"\textbf{{{words}}}" if strong and words else words)
+        rows += [*[r"\midrule"] * (index in table.rules), " & ".join(cells) + r" \\"]
     caption = ". ".join(part.rstrip(".") for part in (table.title, table.note) if part)
     return [
         r"\begin{table}",
@@ -277,7 +264,7 @@ def latex_table(table: Table) -> list[str]:
         *(_latex_groups(table) if table.groups else []),
         " & ".join(latex_text(name) for name in table.header) + r" \\",
         r"\midrule",
-        *(line for index in range(len(table.rows)) for line in _latex_row(table, index)),
+        *rows,
         r"\bottomrule",
         r"\end{tabular}}",
         rf"\caption{{{latex_text(caption)}.}}",
@@ -287,7 +274,6 @@ def latex_table(table: Table) -> list[str]:
 
 
 def _latex_groups(table: Table) -> list[str]:
-    """Return the lines over the header: the groups' titles, and a rule under each."""
     cells, rules, column = [], [], 1
     for title, span in table.groups:
         cells.append(rf"\multicolumn{{{span}}}{{c}}{{{latex_text(title)}}}" if title else " & " * (span - 1))
@@ -295,18 +281,6 @@ def _latex_groups(table: Table) -> list[str]:
             rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
         column += span
     return [" & ".join(cells) + r" \\", " ".join(rules)]
-
-
-def _latex_row(table: Table, index: int) -> list[str]:
-    """Return the line of a row, after a rule where one is drawn."""
-    cells = []
-    for column, cell in enumerate(table.rows[index]):
-        words = table.text(cell, r" {{\scriptsize [{}, {}]}}", latex_text)
-        words = rf"\texttt{{{words}}}" if isinstance(cell, Name) else words
-        strong = index in table.strong or (index, column) in table.best
-        cells.append(rf"\textbf{{{words}}}" if strong and words else words)
-    rule = [r"\midrule"] if index in table.rules else []
-    return [*rule, " & ".join(cells) + r" \\"]
 
 
 # --- the terminal ---
@@ -330,7 +304,7 @@ def terminal(report: Report) -> RenderableType:
     return Group(*parts)
 
 
-def text(report: Report) -> str:
+def to_text(report: Report) -> str:
     """Return the terminal's output as text for a file."""
     out = io.StringIO()
     Console(file=out, width=WIDTH, highlight=False, markup=False).print(terminal(report), crop=False)
@@ -360,7 +334,6 @@ class Unbroken:
         names.min_width = max(widths, default=1)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render the table as it is where it fits."""
         needed = Measurement.get(PLAIN, PLAIN.options, self.table)
         if needed.minimum <= options.max_width:
             yield self.table
@@ -408,26 +381,21 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
         short = short if len(short) <= 4 else f"{short[:4]}."
         header = f"{short}\n{name}" if title else name
         result.add_column(header, justify="left" if table.is_text(column) else "right", overflow="fold")
-    for index in range(len(table.rows)):
+    for index, row in enumerate(table.rows):
         if index in table.rules:
             result.add_section()
-        result.add_row(*_terminal_row(table, index))
+        cells = []
+        for column, cell in enumerate(row):
+            best, whole = (index, column) in table.best, isinstance(cell, Name)
+            style = "bold" if best or index in table.strong else ""
+            overflow: OverflowMethod | None = "ignore" if whole else None
+            cells.append(Text(table.text(cell) + "*" * best, style=style, no_wrap=whole or None, overflow=overflow))
+        result.add_row(*cells)
     if table.best:
         result.caption = "* best of its column"
         result.caption_justify = "left"
     named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
     return result if named is None else Unbroken(result, named)
-
-
-def _terminal_row(table: Table, index: int) -> list[Text]:
-    cells = []
-    for column, cell in enumerate(table.rows[index]):
-        best = (index, column) in table.best
-        style = "bold" if best or index in table.strong else ""
-        whole = isinstance(cell, Name)
-        words = table.text(cell) + "*" * best
-        cells.append(Text(words, style=style, no_wrap=whole or None, overflow="ignore" if whole else None))
-    return cells
 
 
 def _in_parts(table: Table) -> list[Table]:
@@ -473,9 +441,9 @@ def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
 
 
 WRITERS: Mapping[str, Callable[[Report], str]] = {
-    "table": text,
-    "markdown": markdown,
-    "latex": latex,
+    "table": to_text,
+    "markdown": to_markdown,
+    "latex": to_latex,
     "json": lambda report: json.dumps(report.data, indent=2) + "\n",
 }
 """Format -> its writer; `csv_tables` writes one file per table."""
