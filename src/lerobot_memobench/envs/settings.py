@@ -359,7 +359,7 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
+        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite)}
 
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
@@ -368,7 +368,7 @@ SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in N
 """Settings with an effect on rollouts."""
 
 
-def revision(suite: str, difficulty: str) -> dict[str, int]:
+def revision(suite: str) -> dict[str, int]:
     """Return protocol entries of a suite that changed with versions: holds and goals of strict tasks."""
     return {HOLD: HOLD_MEAN, GOALS: STRICT_GOALS} if suite == STRICT else {}
 

@@ -42,7 +42,7 @@ from lerobot_memobench.run.command_line import (
 )
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
-from lerobot_memobench.tasks.task import PUBLISHED, STANDARD
+from lerobot_memobench.tasks.task import PUBLISHED
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
@@ -160,7 +160,7 @@ def check_version(card: Mapping[str, Any]) -> None:
     """
     run, protocol = card["runs"][-1], card["protocol"]
     version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
-    for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
+    for name, here in revision(protocol.get("suite", PUBLISHED)).items():
         if (there := protocol.get(name)) != here:
             raise MemobenchError(
                 f"another version ran the card ({name}={there} on the card, {name}={here} here); repeat it with that "
