@@ -105,7 +105,7 @@ def test_versions_of_a_task_are_not_mixed() -> None:
         by_task([rollout("t", "musical", "S", [1], True)])
 
 
-WHOSE = {"policy": "act 1", "run": "1", "inputs": "pixels"}
+SHARED = {"referent": "fixed", "inputs": "pixels"}
 
 
 @pytest.mark.parametrize(
@@ -116,12 +116,11 @@ WHOSE = {"policy": "act 1", "run": "1", "inputs": "pixels"}
         ({"replan_steps": 20}, "replan intervals (20, 5)"),
         ({"seed": 5002}, "seeds of episode 0 (7, 4999)"),
         ({"inputs": "poses"}, "policy inputs (pixels, poses)"),
-        ({"run": None}, "1 rollout of 4 names no policy"),
     ],
 )
 def test_mixed_protocols_are_noted(changes: dict[str, Any], named: str) -> None:
-    mine = [rollout("t", "temporal", "S", [1], True, k, **WHOSE) for k in range(3)]
-    notes = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**WHOSE, **changes})])
+    mine = [rollout("t", "temporal", "S", [1], True, k, **SHARED) for k in range(3)]
+    notes = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**SHARED, **changes})])
     assert [named in note for note in notes] == ([True] if named else [])
     assert mixtures([rollout("t", "temporal", "S", [1], True, k) for k in range(2)]) == [], "equal protocols"
 
