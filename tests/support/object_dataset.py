@@ -11,12 +11,12 @@ from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.episodes import DemonstrationRecord
 from lerobot_memobench.datasets.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
-from lerobot_memobench.tasks.catalogue import DEMO_TASK
 from tests.support.synthetic_dataset import clock_at
 
 LENGTHS, PROMPTS = (40, 23, 31), (6, 8, 0)
 TASKS = ("put the butter into the bowl", "open the drawer", "put the butter into the bowl")
-NAMES = (DEMO_TASK, "put_the_milk_picked_up_in_the_prompt_video_on_the_plate", DEMO_TASK)
+BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
+NAMES = (BUTTER, "put_the_milk_picked_up_in_the_prompt_video_on_the_plate", BUTTER)
 
 
 def slots_at(rng: np.random.Generator, places: np.ndarray, lit: int | None = None) -> np.ndarray:

@@ -64,10 +64,11 @@ def tasks(
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
-    found, problems = list[Task](), list[str]()
-    for place in [task_folder(name) for name in task_names(suite=suite)] if folder is None else find_tasks(folder):
+    found = [get_task(name) for name in task_names(suite=suite)] if folder is None else list[Task]()
+    problems: list[str] = []
+    for place in [] if folder is None else find_tasks(folder):
         try:
-            found.append(get_task(place.name) if folder is None else load_task(place))
+            found.append(load_task(place))
         except MemobenchError as error:
             problems.append(str(error))
     if not found:

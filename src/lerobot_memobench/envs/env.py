@@ -300,8 +300,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Return the episode's line for the log."""
         self._check_began("record")
         if self._not_run is None:
-            seconds = time.monotonic() - self._started
-            return episode_record(self.episode, self._number, seconds)
+            return episode_record(self.episode, self._number, time.monotonic() - self._started)
         variants = len(self._task.random_variants) if self.settings.evidence else None
         return not_run_record(self._task, self._number, self._scene_seed, self._not_run, variants)
 

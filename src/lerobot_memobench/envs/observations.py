@@ -48,11 +48,10 @@ METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL
 
 # --- inputs of a policy ---
 
-PIXEL_INPUT, DETECTIONS, PRIVILEGED, SIMULATOR, MEMORY_TEXT = (
-    *("pixels", "detections", "privileged object state", "privileged simulator state", "oracle memory text"),
-)
+PIXEL_INPUT, DETECTIONS = "pixels", "detections"
+PRIVILEGED, SIMULATOR = "privileged object state", "privileged simulator state"
+MEMORY_TEXT, NO_INPUT = "oracle memory text", "nothing"
 """Names of policy inputs in reports. Detections are the objects that a detector finds in pixels."""
-NO_INPUT = "nothing"
 
 READ_OBJECTS = ("act", "diffusion", "tdmpc", "gaussian_actor")
 """LeRobot policies that read `observation.environment_state` if trained on it; the others ignore it."""

@@ -49,8 +49,6 @@ PROMPT_IN = (AUTO, STEPS, RESET)
 its configuration. It waits while `observation.phase` is 0 and discards planned actions when it becomes 1. For other
 policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a known policy it means ``steps``."""
 
-REFERENT_VALUES = (*REFERENTS, DRAWN)
-"""Values of ``referent``; strict tasks always use the last one."""
 RELATIVE = "relative"
 QUALITIES = ("default", "high")
 EVERY = -1
@@ -82,19 +80,14 @@ reached without memory by marks in the scene and a clock, goals of revision 2 by
 that passes home, goals of revision 3 by a clock, because returns without an event were held."""
 SCENE_HASHES = "scene_hash_version"
 """Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
-UPSTREAM_ONLY: Mapping[str, Any] = {
-    **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False, "evidence": False},
-    **{"pause_steps": 0, "speed": 1.0, **MEMORY_CONTROLS},
-}
-"""Settings with a fixed value in the authors' evaluation."""
-LIBERO_ONLY = {
-    **{"difficulty": STANDARD, "protocol": BY_PAPER, "referent": REFERENTS[0], "oracle_memory": False},
-    **{"evidence": False, "salt": None, "expert_action": False, "blind_action": False, "obs_type": PIXELS},
-    "demonstration_prompt": True,
-    **MEMORY_CONTROLS,
-}
-"""Settings with a fixed value in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert, and
-object slots lack their classes."""
+UPSTREAM_ONLY = ("suite", "referent", "oracle_memory", "pause_steps", "speed", "evidence", *MEMORY_CONTROLS)
+"""Settings that keep their default in the authors' evaluation."""
+LIBERO_ONLY = (
+    *("difficulty", "protocol", "referent", "oracle_memory", "evidence", "salt", "expert_action", "blind_action"),
+    *("obs_type", "demonstration_prompt", *MEMORY_CONTROLS),
+)
+"""Settings that keep their default in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert,
+and object slots lack their classes."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None, usual: str = "") -> Any:
@@ -157,7 +150,7 @@ class EnvSettings:
     referent: str = setting(
         "fixed",
         "the published goals; random: the seed decides the goal that the prompt shows; strict tasks are always drawn",
-        REFERENT_VALUES,
+        (*REFERENTS, DRAWN),
     )
     demonstration_prompt: bool = setting(True, "object and procedural tasks begin with their demonstration prompt")
     prompt_in: str = setting(
@@ -320,14 +313,14 @@ class EnvSettings:
         elif accepted["values"]:
             check_choice(name, value, accepted["values"])
 
-    def _require(self, fixed: Mapping[str, Any], reason: str) -> None:
-        """Raise for a setting with another value than the fixed one."""
-        for name, value in fixed.items():
-            asked = getattr(self, name)
-            if asked != value:
+    def _require(self, names: Sequence[str], reason: str) -> None:
+        """Raise unless settings have their default."""
+        defaults = {each.name: each.default for each in fields(self)}
+        for name in names:
+            if (value := getattr(self, name)) != defaults[name]:
+                default = str(defaults[name]).lower()
                 raise MemobenchError(
-                    f"{name} is {str(asked).lower()}, but {reason} requires "
-                    f"{name}={str(value).lower()}; leave {name} out"
+                    f"{name} is {str(value).lower()}, but {reason} requires {name}={default}; leave {name} out"
                 )
 
     def _set(self, **values: Any) -> None:

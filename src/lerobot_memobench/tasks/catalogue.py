@@ -41,9 +41,6 @@ ALL_SUITES: tuple[str, ...] = (*SUITES, *LIBERO_SUITES)
 GROUPS: tuple[str, ...] = (*MEMORY_TYPES, *LIBERO_SUITES)
 """Groups of tasks in reports, and LeRobot's suites: memory types, and the suites of LIBERO."""
 
-DEMO_TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
-"""Short task of the demo: only the demonstration prompt shows which of three bowls is correct."""
-
 _PROMPT_WORDS: tuple[tuple[str, PromptKind], ...] = (
     ("picked up", "pick"),
     ("pointed", "point"),

@@ -52,5 +52,5 @@ def longest_gap(task: Task) -> Gap | None:
 
 @cache
 def _measured() -> dict[str, list[list[int] | None]]:
-    found: dict[str, list[list[int] | None]] = json.loads(GAPS_FILE.read_text()) if GAPS_FILE.is_file() else {}
+    found: dict[str, list[list[int] | None]] = json.loads(GAPS_FILE.read_text())
     return found
