@@ -380,13 +380,11 @@ class RecordedEpisode:
 
     Attributes:
         columns: values per frame; the column ``task`` is the instruction.
-        whole: fields that a replay must reproduce (`DemonstrationRecord.determined`), and the language rows.
         start: first frame in the dataset's global index.
     """
 
     record: DemonstrationRecord
     columns: Columns
-    whole: dict[str, Any]
     start: int
 
 
@@ -404,15 +402,11 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    whole = {key: value for key, value in record.determined().items() if value != ""}
-    if LANGUAGE in columns:
-        whole[LANGUAGE] = columns[LANGUAGE][0]
-        changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
-        if changed is not None:
-            raise MemobenchError(
-                f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
-            )
-    return RecordedEpisode(record, columns, whole, episode.start)
+    language = columns.get(LANGUAGE, [])
+    changed = next((frame for frame, rows in enumerate(language) if rows != language[0]), None)
+    if changed is not None:
+        raise MemobenchError(f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode")
+    return RecordedEpisode(record, columns, episode.start)
 
 
 def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[str | None], length: int) -> None:

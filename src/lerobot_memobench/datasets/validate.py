@@ -336,9 +336,11 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
     if not np.array_equal(actions, executed):
         again = replace(again, actions=actions, executed=again.actions)
     columns_again = labels(again)
-    whole = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
+    facts = {key: value for key, value in record.determined().items() if value != ""}
+    facts |= {LANGUAGE: columns[LANGUAGE][0]} if LANGUAGE in columns else {}
+    facts_again = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
     of_episode = next(
-        (Disagreement(key, None, old, whole[key]) for key, old in recorded.whole.items() if old != whole[key]), None
+        (Disagreement(key, None, old, facts_again[key]) for key, old in facts.items() if old != facts_again[key]), None
     )
     if of_episode is not None and of_episode.column == "digest" and again.executed is not None:
         of_episode = replace(
