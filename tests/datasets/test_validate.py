@@ -128,11 +128,7 @@ def decoded(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("camera", "frames", "first"),
-    [
-        ("wrist_image", slice(-1, None), FRAMES - 1),
-        ("image", "other episode", 0),
-    ],
+    ("camera", "frames", "first"), [("wrist_image", slice(-1, None), FRAMES - 1), ("image", "other episode", 0)]
 )
 def test_other_images_are_found(simulated, copy, camera, frames, first):
     folder = copy(simulated)

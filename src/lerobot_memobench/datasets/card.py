@@ -299,10 +299,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
     tables = MADE_BY + text.partition(MADE_BY)[2].partition("## Columns")[0].rstrip() + "\n"
     with explaining_disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-        return [
-            write_file(out / TABLES_FILE, tables),
-            write_file(out / MANIFEST_FILE, _short_manifest(manifest)),
-        ]
+        return [write_file(out / TABLES_FILE, tables), write_file(out / MANIFEST_FILE, _short_manifest(manifest))]
 
 
 def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:

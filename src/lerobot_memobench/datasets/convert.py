@@ -27,14 +27,7 @@ from pydantic import BaseModel
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
 from lerobot_memobench.datasets.generate import check_room, run_size
-from lerobot_memobench.datasets.hdf5 import (
-    NO_SEED,
-    PublishedFile,
-    Unusable,
-    demo_number,
-    first_line,
-    unusable_on_error,
-)
+from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable, demo_number, first_line, unusable_on_error
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, restore, task_of, unlike_the_catalogue
 from lerobot_memobench.datasets.stage import (

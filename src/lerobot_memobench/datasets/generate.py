@@ -19,12 +19,7 @@ from typing import Any
 from lerobot_memobench.datasets.card import SCRIPTED
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING, is_dataset
 from lerobot_memobench.datasets.record import HOLD_FRAMES, RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.stage import (
-    FINISHED_EARLY,
-    check_destination,
-    episodes_folder,
-    finished_manifest,
-)
+from lerobot_memobench.datasets.stage import FINISHED_EARLY, check_destination, episodes_folder, finished_manifest
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words

@@ -27,13 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import (
-    Malformed,
-    check_fetched,
-    check_regular,
-    parsed,
-    refusing,
-)
+from lerobot_memobench.io import Malformed, check_fetched, check_regular, parsed, refusing
 from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:

@@ -99,10 +99,7 @@ class _Check:
 
 
 def validate(
-    folder: Path | str,
-    *,
-    workers: int = 1,
-    progress: Callable[[int, int, CheckResult], None] = lambda *_: None,
+    folder: Path | str, *, workers: int = 1, progress: Callable[[int, int, CheckResult], None] = lambda *_: None
 ) -> list[CheckResult]:
     """Replay the episodes of a dataset and check its files.
 
