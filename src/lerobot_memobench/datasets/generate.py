@@ -1,7 +1,7 @@
 """Generate demonstrations with the scripted experts, and assemble them to a dataset.
 
 A run that was killed is continued when the same command is given again: finished episodes are kept in ``DIR/.staging``
-(see `staging`), and the dataset is assembled from them at the end. Each episode is a function of task, seed and
+(see `stage`), and the dataset is assembled from them at the end. Each episode is a function of task, seed and
 settings, so neither interruptions nor the number of workers change the result.
 """
 
