@@ -100,10 +100,6 @@ class TextEncoder(Protocol):
     """Frozen text encoder: texts -> embeddings (N, dim) float32."""
 
     @property
-    def key(self) -> str:
-        """Identity of the encoder."""
-
-    @property
     def dim(self) -> int:
         """Width of an embedding."""
 
