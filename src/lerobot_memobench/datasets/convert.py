@@ -182,9 +182,6 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Con
     """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
 
     An archive's files will be unpacked below ``unpacked``.
-
-    Raises:
-        MemobenchError: there is none, or the archive is damaged.
     """
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")

@@ -73,11 +73,7 @@ class Info(TypedDict):
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """Return ``meta/info.json``.
-
-    Raises:
-        MemobenchError: there is none, it is damaged, or of another format of LeRobot.
-    """
+    """Return ``meta/info.json``; refuse a folder without it, damage, and other formats of LeRobot."""
     try:
         info: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
@@ -332,7 +328,7 @@ class ListedEpisode:
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:
-    """Return a dataset's episodes with their records, in order."""
+    """Return a dataset's episodes with their records, in order; refuse a record that is not this package's."""
     read_info(folder)
     rows = _rows(folder)
     own = ("episode_index", EPISODE_INFO)

@@ -111,9 +111,6 @@ def validate(
 
     Returns:
         The result of each episode, in order, then of each file with a disagreement or a note.
-
-    Raises:
-        MemobenchError: there is no dataset.
     """
     folder = Path(folder).absolute()
     if workers < 1:
@@ -213,9 +210,6 @@ def check_file(path: Path, recorded: FileHash | None) -> str | None:
     """Read a file to its end and compare it with its recorded hash; return a note if it was written again.
 
     Other bytes in a file of equal size are damage; tools that encode or write a file again change its size.
-
-    Raises:
-        MemobenchError: it is missing or damaged.
     """
     if not path.is_file():
         raise MemobenchError(f"the file is missing; {ADVICE}")
