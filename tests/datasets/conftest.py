@@ -104,7 +104,8 @@ def as_recorded(demo: Demonstration) -> RecordedEpisode:
     columns, record = labels(demo), DemonstrationRecord.of(demo)
     frames = {"states": demo.states, "observation.state": demo.proprio, OBJECTS: demo.objects}
     frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns}
-    return RecordedEpisode(record, frames, record.determined() | {LANGUAGE: persistent_rows(columns)}, 0)
+    frames[LANGUAGE] = [persistent_rows(columns)] * len(demo)
+    return RecordedEpisode(record, frames, 0)
 
 
 def moving_images(length: int, size: int, rng: np.random.Generator) -> np.ndarray:

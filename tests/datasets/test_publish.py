@@ -164,11 +164,7 @@ HfApi.{name} = killed
 
 
 @pytest.mark.parametrize(
-    ("name", "after"),
-    [
-        ("preupload_lfs_files", True),
-        pytest.param("upload_file", True, marks=pytest.mark.slow),
-    ],
+    ("name", "after"), [("preupload_lfs_files", True), pytest.param("upload_file", True, marks=pytest.mark.slow)]
 )
 def test_killed_upload_continues(hub, machine, folder, tmp_path, name, after):
     code = PUSH.format(folder=str(folder), repo=REPO)

@@ -68,8 +68,8 @@ def test_file_of_the_authors_script(drawer, tmp_path, backwards):
         np.testing.assert_allclose(episode.columns["observation.state"], drawer.proprio, rtol=0, atol=1e-6)
         np.testing.assert_array_equal(episode.columns["privileged.environment_state"], drawer.objects)
         for name, pose in drawer.fixture_poses.items():
-            np.testing.assert_array_equal(episode.whole["fixture_poses"][name], pose)
-        assert (episode.record.world, episode.whole["key_frames"], episode.whole["success"]) == (LIBERO, [SHUT], True)
+            np.testing.assert_array_equal(episode.record.fixture_poses[name], pose)
+        assert (episode.record.world, episode.record.key_frames, episode.record.success) == (LIBERO, [SHUT], True)
     with h5py.File(path) as file:
         assert np.array_equal(file["data/demo_1/states"][:], drawer.states) != backwards
 

@@ -128,11 +128,7 @@ def decoded(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("camera", "frames", "first"),
-    [
-        ("wrist_image", slice(-1, None), FRAMES - 1),
-        ("image", "other episode", 0),
-    ],
+    ("camera", "frames", "first"), [("wrist_image", slice(-1, None), FRAMES - 1), ("image", "other episode", 0)]
 )
 def test_other_images_are_found(simulated, copy, camera, frames, first):
     folder = copy(simulated)
@@ -191,7 +187,9 @@ def test_replay_compares_fields_of_the_episode(stove, simulated, tmp_path):
     assert str(replay(as_recorded(replace(stove, success=False)))) == "success: recorded False, replayed True"
     assert replay(as_recorded(replace(stove, seed=10_001))).column == "states"
     episode = read_episode(simulated, 0)
-    assert replay(replace(episode, whole={**episode.whole, "key_frames": [1, 2]})).column == "key_frames"
+    assert (
+        replay(replace(episode, record=episode.record.model_copy(update={"key_frames": [1, 2]}))).column == "key_frames"
+    )
     columns = {key: value for key, value in episode.columns.items() if key != "states"}
     columns["observation.state"] = columns["observation.state"] + np.float32(1e-3)
     assert replay(replace(episode, columns=columns)).column == "observation.state", "without states/"

@@ -111,11 +111,7 @@ def card_from_frames(folder: Path, episodes: Sequence[Described], repo_id: str |
 
 
 def hub_card(folder: Path, repo_id: str) -> str:
-    """Return the card of a dataset for ``repo_id`` on the hub; its examples load the dataset from there.
-
-    Raises:
-        MemobenchError: the dataset is damaged, or none of its episodes is one of this benchmark.
-    """
+    """Return the card of a dataset for ``repo_id`` on the hub; its examples load the dataset from there."""
     with undamaged(folder):
         episodes = list_episodes(folder)
         card = own_card(folder, len(episodes))
@@ -125,11 +121,7 @@ def hub_card(folder: Path, repo_id: str) -> str:
 
 
 def described_of(folder: Path, episodes: Iterable[ListedEpisode]) -> list[Described]:
-    """Return records and lengths of a dataset's episodes, without episodes of other programs.
-
-    Raises:
-        MemobenchError: no episode has a record.
-    """
+    """Return records and lengths of a dataset's episodes, without episodes of other programs."""
     described = [(episode.record, episode.length) for episode in episodes if episode.record is not None]
     if not described:
         raise MemobenchError(f"{folder} has no episode of this benchmark: {STRANGER}")
@@ -299,10 +291,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
     tables = MADE_BY + text.partition(MADE_BY)[2].partition("## Columns")[0].rstrip() + "\n"
     with explaining_disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-        return [
-            write_file(out / TABLES_FILE, tables),
-            write_file(out / MANIFEST_FILE, _short_manifest(manifest)),
-        ]
+        return [write_file(out / TABLES_FILE, tables), write_file(out / MANIFEST_FILE, _short_manifest(manifest))]
 
 
 def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:

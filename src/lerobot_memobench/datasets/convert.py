@@ -28,14 +28,7 @@ from lerobot_memobench.constants import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
 from lerobot_memobench.datasets.generate import check_room, run_size
-from lerobot_memobench.datasets.hdf5 import (
-    NO_SEED,
-    PublishedFile,
-    Unusable,
-    demo_number,
-    first_line,
-    unusable_on_error,
-)
+from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable, demo_number, first_line, unusable_on_error
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, restore, task_of, unlike_the_catalogue
 from lerobot_memobench.datasets.stage import (
@@ -189,9 +182,6 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Con
     """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
 
     An archive's files will be unpacked below ``unpacked``.
-
-    Raises:
-        MemobenchError: there is none, or the archive is damaged.
     """
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")

@@ -73,11 +73,7 @@ class Info(TypedDict):
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """Return ``meta/info.json``.
-
-    Raises:
-        MemobenchError: there is none, it is damaged, or of another format of LeRobot.
-    """
+    """Return ``meta/info.json``; refuse a folder without it, damage, and other formats of LeRobot."""
     try:
         info: dict[str, Any] = read_json(folder / INFO_FILE, Info, ADVICE)
     except FileNotFoundError:
@@ -332,7 +328,7 @@ class ListedEpisode:
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:
-    """Return a dataset's episodes with their records, in order."""
+    """Return a dataset's episodes with their records, in order; refuse a record that is not this package's."""
     read_info(folder)
     rows = _rows(folder)
     own = ("episode_index", EPISODE_INFO)
@@ -380,13 +376,11 @@ class RecordedEpisode:
 
     Attributes:
         columns: values per frame; the column ``task`` is the instruction.
-        whole: fields that a replay must reproduce (`DemonstrationRecord.determined`), and the language rows.
         start: first frame in the dataset's global index.
     """
 
     record: DemonstrationRecord
     columns: Columns
-    whole: dict[str, Any]
     start: int
 
 
@@ -404,15 +398,11 @@ def read_episode(root: Path | str, episode_index: int) -> RecordedEpisode:
     if record is None:
         raise MemobenchError(STRANGER)
     _check_record(rows[0], record, texts, len(columns["frame_index"]))
-    whole = {key: value for key, value in record.determined().items() if value != ""}
-    if LANGUAGE in columns:
-        whole[LANGUAGE] = columns[LANGUAGE][0]
-        changed = next((frame for frame, rows in enumerate(columns[LANGUAGE]) if rows != whole[LANGUAGE]), None)
-        if changed is not None:
-            raise MemobenchError(
-                f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode"
-            )
-    return RecordedEpisode(record, columns, whole, episode.start)
+    language = columns.get(LANGUAGE, [])
+    changed = next((frame for frame, rows in enumerate(language) if rows != language[0]), None)
+    if changed is not None:
+        raise MemobenchError(f"{LANGUAGE} at frame {changed} differs from frame 0, expected equal rows in an episode")
+    return RecordedEpisode(record, columns, episode.start)
 
 
 def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[str | None], length: int) -> None:

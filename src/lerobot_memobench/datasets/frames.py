@@ -100,10 +100,6 @@ class TextEncoder(Protocol):
     """Frozen text encoder: texts -> embeddings (N, dim) float32."""
 
     @property
-    def key(self) -> str:
-        """Identity of the encoder."""
-
-    @property
     def dim(self) -> int:
         """Width of an embedding."""
 
@@ -179,11 +175,7 @@ class FrameLookup:
         return int(self.episodes[-1])
 
     def locate(self, index: int) -> tuple[int, int]:
-        """Return the episode and the frame in it of a global index.
-
-        Raises:
-            MemobenchError: the dataset has no such frame.
-        """
+        """Return the episode and the frame in it of a global index, which the dataset must have."""
         if not 0 <= index < self.num_frames:
             raise MemobenchError(
                 f"frame {index} is outside the dataset {self.root}, which has {self.num_frames} frames; train and look "
@@ -214,11 +206,7 @@ class FrameLookup:
         return self._changes[episode]
 
     def memory_texts(self, indices: Sequence[int]) -> list[str]:
-        """Return the oracle memory texts of frames by their global indices.
-
-        Raises:
-            MemobenchError: the dataset has no such column.
-        """
+        """Return the oracle memory texts of frames by their global indices."""
         if self._memory_rows is None:
             raise MemobenchError(
                 f"the dataset {self.root} has no column '{MEMORY_COLUMN}', which --policy.oracle_memory=true reads; "
@@ -227,11 +215,7 @@ class FrameLookup:
         return [self.memories[row] for row in self._memory_rows[np.asarray(indices, dtype=np.int64)].tolist()]
 
     def text_rows(self, level: str) -> np.ndarray:
-        """Return the row of `text_embeddings` for each frame (N,) int32; -1 for a frame without a text.
-
-        Raises:
-            MemobenchError: the dataset has no texts at this level.
-        """
+        """Return the row of `text_embeddings` for each frame (N,) int32; -1 for a frame without a text."""
         if level not in self._subgoal_rows:
             known = ", ".join(self._subgoal_rows) or "none"
             raise MemobenchError(
@@ -245,9 +229,6 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     """Read columns of numbers, each (N, ...), and phases and texts of a dataset.
 
     `OBJECTS` names the objects, whichever column of the dataset holds them.
-
-    Raises:
-        MemobenchError: a column is missing, or frames are not numbered 0, 1, 2, ...
     """
     table = read_frame_table(root)
     columns: dict[str, np.ndarray] = {}

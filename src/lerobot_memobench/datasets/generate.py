@@ -1,7 +1,7 @@
 """Generate demonstrations with the scripted experts, and assemble them to a dataset.
 
 A run that was killed is continued when the same command is given again: finished episodes are kept in ``DIR/.staging``
-(see `staging`), and the dataset is assembled from them at the end. Each episode is a function of task, seed and
+(see `stage`), and the dataset is assembled from them at the end. Each episode is a function of task, seed and
 settings, so neither interruptions nor the number of workers change the result.
 """
 
@@ -20,12 +20,7 @@ from lerobot_memobench.constants import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE,
 from lerobot_memobench.datasets.card import SCRIPTED
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING, is_dataset
 from lerobot_memobench.datasets.record import HOLD_FRAMES, RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.stage import (
-    FINISHED_EARLY,
-    check_destination,
-    episodes_folder,
-    finished_manifest,
-)
+from lerobot_memobench.datasets.stage import FINISHED_EARLY, check_destination, episodes_folder, finished_manifest
 from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words

@@ -131,12 +131,7 @@ def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
 
 
 def _read_states(
-    sim: Simulation,
-    task: Task,
-    states: States,
-    fixture_poses: dict[str, Pose],
-    exec_start: int,
-    evaluate: bool,
+    sim: Simulation, task: Task, states: States, fixture_poses: dict[str, Pose], exec_start: int, evaluate: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], bool]:
     """Return proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K) and success at states set in order.
 

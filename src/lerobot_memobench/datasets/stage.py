@@ -21,19 +21,17 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
-from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, is_dataset
+from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
@@ -52,8 +50,8 @@ ADVICE = "it is damaged; delete its folder and run the command again"
 # --- a finished episode ---
 
 
-class EpisodeFile(BaseModel):
-    """``episode.json``.
+class StagedEpisode(BaseModel):
+    """``episode.json`` of a finished episode in ``folder``; arrays and videos are read on demand.
 
     Attributes:
         failure: why there is no demonstration of this seed, or None.
@@ -69,24 +67,7 @@ class EpisodeFile(BaseModel):
     language_persistent: list[LanguageRow]
     image_stats: dict[str, dict[str, Any]]
     files: dict[str, str]
-
-
-@dataclass(frozen=True)
-class StagedEpisode:
-    """A finished episode's folder and its `EpisodeFile`; arrays and videos are read on demand."""
-
-    folder: Path
-    content: EpisodeFile
-
-    @property
-    def failure(self) -> str | None:
-        """See `EpisodeFile`."""
-        return self.content.failure
-
-    @property
-    def info(self) -> dict[str, Any]:
-        """Identity and frames, also of a failed episode."""
-        return self.content.info
+    folder: Path = Field(Path(), exclude=True)
 
     @property
     def length(self) -> int:
@@ -101,9 +82,10 @@ class StagedEpisode:
         """Return the file of a camera's video."""
         return self.folder / f"{camera}.mp4"
 
-    def image_stats(self, camera: str) -> Stats:
-        """Return the statistics of a camera's pixels (`ImageHistograms`)."""
-        return {name: np.array(value) for name, value in self.content.image_stats[camera].items()}
+    def camera_stats(self) -> dict[str, Stats]:
+        """Return the statistics of each camera's pixels by the name of its column."""
+        stats = self.image_stats.items()
+        return {image_key(camera): {name: np.array(value) for name, value in one.items()} for camera, one in stats}
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
@@ -112,7 +94,7 @@ class StagedEpisode:
 
     def check(self) -> None:
         """Raise a MemobenchError that names the first file whose hash differs from the recorded one."""
-        for name, expected in self.content.files.items():
+        for name, expected in self.files.items():
             path = self.folder / name
             digest = file_hash(path) if path.is_file() else "missing"
             if digest != expected:
@@ -125,9 +107,10 @@ class StagedEpisode:
 def read_staged(folder: Path) -> StagedEpisode | None:
     """Return the finished episode in ``folder``, or None if there is none."""
     try:
-        return StagedEpisode(folder, read_json(folder / EPISODE_FILE, EpisodeFile, ADVICE))
+        episode: StagedEpisode = read_json(folder / EPISODE_FILE, StagedEpisode, ADVICE)
     except FileNotFoundError:
         return None
+    return episode.model_copy(update={"folder": folder})
 
 
 class StagedJob:
@@ -171,9 +154,7 @@ class EpisodeStage:
     def __enter__(self) -> EpisodeStage:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for video in self._videos.values():
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all files are deleted
                 video.abandon()
@@ -256,10 +237,15 @@ def _publish(
 ) -> StagedEpisode:
     """Add the record, flush everything to the disk, then give the folder its name."""
     files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    content = EpisodeFile(
-        failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files
+    episode = StagedEpisode(
+        failure=failure,
+        info=info,
+        language_persistent=language_rows,
+        image_stats=image_stats,
+        files=files,
+        folder=folder,
     )
-    (temporary / EPISODE_FILE).write_text(content.model_dump_json())
+    (temporary / EPISODE_FILE).write_text(episode.model_dump_json())
     flush_to_disk([*temporary.iterdir(), temporary])
     try:
         temporary.rename(folder)
@@ -269,7 +255,7 @@ def _publish(
             raise MemobenchError(f"{folder} holds another episode; delete it and run again") from None
         return staged
     flush_to_disk([folder.parent])
-    return StagedEpisode(folder, content)
+    return episode
 
 
 def _temporary_folder(folder: Path) -> Path:

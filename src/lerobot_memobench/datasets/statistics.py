@@ -48,9 +48,6 @@ def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
     """Compute the statistics of a dataset's features: exact for numbers, over LeRobot's sample of frames for images.
 
     Held frames do not count for numbers, as in `write`.
-
-    Raises:
-        MemobenchError: a column is missing or damaged.
     """
     features, names = read_info(folder)["features"], list(names)
     cameras = [name for name in names if features[name]["dtype"] in IMAGES]
@@ -87,9 +84,6 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
     """Compare the statistics of features in ``meta/stats.json`` with those of the frames.
 
     Quantiles must lie between the extremes only, because LeRobot's tools average the quantiles of episodes.
-
-    Raises:
-        MemobenchError: naming the first statistic that differs.
     """
     features, kept = read_info(folder)["features"], recorded(folder)
     for name, stats in compute(folder, names).items():
@@ -140,11 +134,7 @@ def lacking(folder: Path, needed: Mapping[str, Collection[str]]) -> list[str]:
 
 
 def complete(folder: Path, names: Sequence[str], notify: Callable[[str], None]) -> None:
-    """Compute the statistics of features that lack some, and add those to a dataset's ``meta/stats.json``.
-
-    Raises:
-        MemobenchError: a column is missing or damaged, or the folder cannot be written.
-    """
+    """Compute the statistics of features that lack some, and add those to a dataset's ``meta/stats.json``."""
     notify(f"computing and adding statistics that {folder / STATS_FILE} lacks: {', '.join(names)}")
     kept = recorded(folder)
     for name, stats in compute(folder, names).items():

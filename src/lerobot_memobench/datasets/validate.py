@@ -98,10 +98,7 @@ class _Check:
 
 
 def validate(
-    folder: Path | str,
-    *,
-    workers: int = 1,
-    progress: Callable[[int, int, CheckResult], None] = lambda *_: None,
+    folder: Path | str, *, workers: int = 1, progress: Callable[[int, int, CheckResult], None] = lambda *_: None
 ) -> list[CheckResult]:
     """Replay the episodes of a dataset and check its files.
 
@@ -113,9 +110,6 @@ def validate(
 
     Returns:
         The result of each episode, in order, then of each file with a disagreement or a note.
-
-    Raises:
-        MemobenchError: there is no dataset.
     """
     folder = Path(folder).absolute()
     if workers < 1:
@@ -215,9 +209,6 @@ def check_file(path: Path, recorded: FileHash | None) -> str | None:
     """Read a file to its end and compare it with its recorded hash; return a note if it was written again.
 
     Other bytes in a file of equal size are damage; tools that encode or write a file again change its size.
-
-    Raises:
-        MemobenchError: it is missing or damaged.
     """
     if not path.is_file():
         raise MemobenchError(f"the file is missing; {ADVICE}")
@@ -335,9 +326,11 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
     if not np.array_equal(actions, executed):
         again = replace(again, actions=actions, executed=again.actions)
     columns_again = labels(again)
-    whole = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
+    facts = {key: value for key, value in record.determined().items() if value != ""}
+    facts |= {LANGUAGE: columns[LANGUAGE][0]} if LANGUAGE in columns else {}
+    facts_again = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
     of_episode = next(
-        (Disagreement(key, None, old, whole[key]) for key, old in recorded.whole.items() if old != whole[key]), None
+        (Disagreement(key, None, old, facts_again[key]) for key, old in facts.items() if old != facts_again[key]), None
     )
     if of_episode is not None and of_episode.column == "digest" and again.executed is not None:
         of_episode = replace(

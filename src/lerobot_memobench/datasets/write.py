@@ -114,7 +114,7 @@ def assemble(
     written = [episode for episode in episodes if episode.failure is None]
     if not written:
         raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
-    if len({tuple(episode.content.image_stats) for episode in written}) > 1:
+    if len({tuple(episode.image_stats) for episode in written}) > 1:
         raise MemobenchError(
             f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
         )
@@ -140,7 +140,7 @@ def _write_lerobot(
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
-    cameras = written[0].content.image_stats
+    cameras = written[0].image_stats
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
@@ -151,7 +151,7 @@ def _write_lerobot(
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
     numbers, listed = _write_frames(meta, written, versions)
-    of_images = aggregate_stats([_camera_statistics(episode) for episode in written]) if cameras else {}
+    of_images = aggregate_stats([episode.camera_stats() for episode in written]) if cameras else {}
     # LeRobot's come in the order of a set, another one in each process.
     meta.stats = numbers | {key: of_images[key] for key in map(image_key, cameras)}
     write_stats(meta.stats, meta.root)
@@ -162,7 +162,7 @@ def _write_lerobot(
 def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
     import av
 
-    for camera in episode.content.image_stats:
+    for camera in episode.image_stats:
         with av.open(str(episode.video(camera))) as container:
             stream = container.streams.video[0]
             return stream.height, stream.width
@@ -249,7 +249,7 @@ def _write_frames(
         counted = {key: value[~arrays[HELD_COLUMN]] for key, value in numeric.items()}
         for key, value in counted.items():
             numbers.setdefault(key, []).append(value)
-        stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)
+        stats = {key: numeric_stats(value) for key, value in counted.items()} | episode.camera_stats()
         files = {
             "data/chunk_index": data.chunk,
             "data/file_index": data.file,
@@ -270,20 +270,14 @@ def numeric_stats(values: NDArray) -> Stats:
     LeRobot averages the quantiles of episodes, which is not a quantile of the dataset. pi0.5 normalises by q01 and q99,
     so they are computed from all frames.
     """
-    flat = values.reshape(len(values), -1)
-    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
-    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
-    return stats | {"count": np.array([len(values)])}
-
-
-def _stats_of(flat: NDArray[np.float64]) -> Stats:
-    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
-    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
-    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
-
-
-def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
-    return {image_key(camera): episode.image_stats(camera) for camera in episode.content.image_stats}
+    flat, blocks = values.reshape(len(values), -1), []
+    for start in range(0, flat.shape[1], BLOCK):
+        block = flat[:, start : start + BLOCK].astype(np.float64)
+        stats = {"min": block.min(0), "max": block.max(0), "mean": block.mean(0), "std": block.std(0)}
+        quantiles = np.quantile(block, QUANTILES, axis=0, overwrite_input=True)
+        blocks.append(stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)})
+    joined = {name: np.concatenate([stats[name] for stats in blocks]) for name in blocks[0]}
+    return joined | {"count": np.array([len(values)])}
 
 
 # --- tables and their files ---
@@ -315,7 +309,7 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
     import datasets
 
     once = datasets.Dataset.from_dict(
-        {LANGUAGE: [episode.content.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
+        {LANGUAGE: [episode.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
     ).with_format("arrow")[:]
     return once.column(LANGUAGE).combine_chunks().take(np.zeros(episode.length, dtype=np.int64))
 
@@ -381,18 +375,25 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
 
     columns: list[dict[str, Any]] = [{} for _ in episodes]
     limit = meta.video_files_size_in_mb * 1024**2
-    for camera in episodes[0].content.image_stats:
+    for camera in episodes[0].image_stats:
         key, chunk, file = image_key(camera), 0, 0
-        videos = [(episode.video(camera), episode.length) for episode in episodes]
-        for group in _grouped([video.stat().st_size for video, _ in videos], limit):
-            assert meta.video_path is not None
-            path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
+        groups: list[list[int]] = []  # consecutive episodes of at most `limit` bytes; a larger one forms its own group
+        total = 0
+        for number, episode in enumerate(episodes):
+            size = episode.video(camera).stat().st_size
+            if not groups or total + size > limit:
+                groups.append([])
+                total = 0
+            groups[-1].append(number)
+            total += size
+        for group in groups:
+            path = meta.root / str(meta.video_path).format(video_key=key, chunk_index=chunk, file_index=file)
             path.parent.mkdir(parents=True, exist_ok=True)
-            join_videos([videos[i] for i in group], path)
+            join_videos([(episodes[number].video(camera), episodes[number].length) for number in group], path)
             frames = 0
-            for i in group:
-                start, frames = frames, frames + videos[i][1]
-                columns[i] |= {
+            for number in group:
+                start, frames = frames, frames + episodes[number].length
+                columns[number] |= {
                     f"videos/{key}/chunk_index": chunk,
                     f"videos/{key}/file_index": file,
                     f"videos/{key}/from_timestamp": start / CONTROL_HZ,
@@ -402,16 +403,3 @@ def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode
             meta.features[key].setdefault("info", video_info(path))
         write_info(meta.info, meta.root)
     return columns
-
-
-def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:
-    """Group consecutive positions whose sizes sum up to at most ``limit``; a larger one forms its own group."""
-    groups: list[list[int]] = []
-    total = 0
-    for position, size in enumerate(sizes):
-        if not groups or total + size > limit:
-            groups.append([])
-            total = 0
-        groups[-1].append(position)
-        total += size
-    return groups
