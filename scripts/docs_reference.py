@@ -421,8 +421,8 @@ def policies_page() -> str:
     """Return the page of policy configurations, from their source."""
     parts = [
         "# Policy configuration",
-        "Arguments `policy.<field>=` of `lerobot eval` and `lerobot train`. `memobench_mem` also has the fields of "
-        "LeRobot's `pi05`. *by size*: the value depends on `policy.size` and `policy.perception`.",
+        "Arguments `policy.<field>=` of `lerobot eval` and `lerobot train`, besides those of every policy (`device`, "
+        "`push_to_hub` and so on). *by size*: the value depends on `policy.size` and `policy.perception`.",
     ]
     for name, (path, kind) in POLICIES.items():
         tree = class_of(SOURCE / path, kind)

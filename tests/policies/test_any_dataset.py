@@ -86,7 +86,7 @@ THREE = dict.fromkeys((IMAGES + name for name in ("left", "top", "gripper")), (9
     [
         ({"observation.image": (96, 96)}, 2, 2, 10, "tiny"),
         pytest.param(
-            {IMAGES + "front": (240, 320), IMAGES + "b": (120, 90)}, 14, 7, 30, "small", marks=pytest.mark.slow
+            {IMAGES + "front": (240, 240), IMAGES + "b": (120, 120)}, 14, 7, 30, "small", marks=pytest.mark.slow
         ),
     ],
 )

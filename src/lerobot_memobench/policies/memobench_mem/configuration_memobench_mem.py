@@ -189,6 +189,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
     n_obs_steps: int = setting(1, least=1, most=1)
+    """Always 1: earlier frames are read through the memory."""
     max_state_dim: int = setting(32, used_if=STATE_TOKEN)
     """Numbers of a state, padded; raised to the dataset's, unless weights are loaded."""
 
@@ -200,6 +201,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     tokenizer_name: str | None = None
     """``words``, or a Hugging Face tokenizer; None: that of the size."""
     tokenizer_max_length: int | None = None
+    """Tokens of a prompt; None: those of the size."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
 
     # -- actions

@@ -123,14 +123,6 @@ def thumbnails(pictures: Tensor) -> Tensor:
 # -- pi0.5's image tower ----------------------------------------------------------------------------------------------
 
 
-def pool_tokens(tokens: Tensor) -> Tensor:
-    """Mean-pool the patch tokens of square images (N, g*g, D) to (N, 16, D); g is a multiple of 4 (16 at full size)."""
-    block = round(tokens.shape[1] ** 0.5) // MEMORY_GRID
-    return reduce(
-        tokens, "n (gy by gx bx) d -> n (gy gx) d", "mean", gy=MEMORY_GRID, gx=MEMORY_GRID, by=block, bx=block
-    )
-
-
 class ImageTowerEncoder(ObservationEncoder):
     """pi0.5's frozen image tower, and the projection of its tokens to the language model's width.
 
@@ -189,7 +181,10 @@ class ImageTowerEncoder(ObservationEncoder):
         images = self._resized(images)
         # With mixed precision, tokens of a rollout would differ from cached tokens.
         with torch.autocast(images.device.type, enabled=False):
-            return pool_tokens(self.prefix(images)).to(torch.bfloat16)
+            tokens = self.prefix(images)
+        side, block = MEMORY_GRID, round(tokens.shape[1] ** 0.5) // MEMORY_GRID
+        pooled = reduce(tokens, "n (gy by gx bx) d -> n (gy gx) d", "mean", gy=side, gx=side, by=block, bx=block)
+        return pooled.to(torch.bfloat16)
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return all patch tokens (B, g*g, D) of pictures (B, 3, H, W) in [-1, 1], in the pictures' precision.

@@ -244,23 +244,19 @@ class MemoryMechanism(nn.Module, ABC):
         Args:
             query: the samples' present.
         """
-        return self.read(self.state_after(histories, query), query)
-
-    def state_after(self, histories: Histories, query: Query | None = None) -> State:
-        """Return the states of B samples, each after the last frame of its history."""
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
         with torch.no_grad():
             state = self._state_before(histories, begin, query)
-        if not self.gradient_frames:
-            return state
-        fresh = self.init(len(begin))  # with gradients, for samples without earlier frames
-        early = begin == 0
-        state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
-        left = count - begin
-        ahead = begin[:, None] + torch.arange(int(left.max()), device=begin.device)
-        places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
-        return self._written(state, histories, places, query, left, torch.arange(len(left), device=left.device))
+        if self.gradient_frames:
+            fresh = self.init(len(begin))  # with gradients, for samples without earlier frames
+            early = begin == 0
+            state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
+            left = count - begin
+            ahead = begin[:, None] + torch.arange(int(left.max()), device=begin.device)
+            places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
+            state = self._written(state, histories, places, query, left, torch.arange(len(left), device=left.device))
+        return self.read(state, query)
 
     def _state_before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
         """Return the states of B samples, each after the first ``begin`` (B,) frames of its history.
