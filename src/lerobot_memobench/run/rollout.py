@@ -118,8 +118,8 @@ class Actor:
 
     def act(self, inputs: dict[str, Any]) -> NDArray[np.float32]:
         """Return the environment's actions (B, A)."""
-        policys, environments = self.after
-        action = environments({ACTION: policys(self.actions.select(inputs))})[ACTION]
+        policy_post, env_post = self.after
+        action = env_post({ACTION: policy_post(self.actions.select(inputs))})[ACTION]
         found: NDArray[np.float32] = action.to("cpu").numpy()
         return found
 
