@@ -119,9 +119,8 @@ class Actor:
     def act(self, inputs: dict[str, Any]) -> NDArray[np.float32]:
         """Return the environment's actions (B, A)."""
         policy_post, env_post = self.after
-        actions: NDArray[np.float32] = (
-            env_post({ACTION: policy_post(self.actions.select(inputs))})[ACTION].cpu().numpy()
-        )
+        action = env_post({ACTION: policy_post(self.actions.select(inputs))})[ACTION]
+        actions: NDArray[np.float32] = action.cpu().numpy()
         return actions
 
 
