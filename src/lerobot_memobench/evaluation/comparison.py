@@ -45,9 +45,9 @@ from lerobot_memobench.evaluation.statistics import (
     detectable,
     difference_interval,
     holm,
+    interval_of,
     mcnemar,
     newcombe,
-    percentiles,
     sign_flip,
 )
 from lerobot_memobench.evaluation.tables import (
@@ -280,7 +280,7 @@ class _Task(NamedTuple):
 
 def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     partners = {id(mine): other for mine, other in pairs}
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
     tasks = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
@@ -290,7 +290,7 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        scenes = _scenes(group)
+        scenes = _scenes(group)  # rollouts of one scene depend on each other, so they are drawn together
         drawn = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
         samples = {
             metric: _Sample(value, value[drawn].mean(axis=1))
@@ -397,9 +397,8 @@ def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Es
     shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
     if value is None or len(shares) <= 0.9 * len(drawn):
         return Estimate(value)
-    least, most = (bound / (1.0 - a) for bound in bounds)
-    low, high = percentiles(np.array(shares))
-    return Estimate(value, min(low, least), min(max(high, most), 1.0))
+    low, high = interval_of(np.array(shares), (bounds[0] / (1.0 - a), bounds[1] / (1.0 - a)))
+    return Estimate(value, low, min(high, 1.0))
 
 
 # --- the report ---

@@ -1,6 +1,7 @@
 """The report for the browser: one page with its script, style and data inside, and a folder of videos.
 
-`metrics` computes all rates; the page (``page/``) only draws and filters. Its content security policy allows only this
+`metrics` computes all rates; the page (``page/``) only draws and filters. Everything but the videos is inside
+``index.html``, because a browser lets a page from disk read no other file. Its content security policy allows only this
 style, this script and videos in its own folder, so the page cannot reach the network.
 """
 
@@ -113,7 +114,7 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         if not (out / PAGE).exists():
             write_file(out / PAGE, UNFINISHED)  # marks the folder as a report
         place_videos(chosen)
-        write_file(out / PAGE, text)
+        write_file(out / PAGE, text)  # after its videos, so that a killed command leaves no links to missing ones
         linked = _remove_other_videos(out, chosen)
     return HtmlReport(
         page=out / PAGE,
