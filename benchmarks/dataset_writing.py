@@ -33,16 +33,16 @@ import numpy as np
 
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
-from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.datasets.hdf5 import PublishedFile
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.columns import (
+from lerobot_memobench.datasets.layout import (
     EPISODE_INFO,
     EXECUTED_ACTION,
     PRIVILEGED,
     dataset_features,
     image_key,
 )
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.published_files import write_published
@@ -122,7 +122,7 @@ def plain_loop(episodes: Iterable[tuple[Demonstration, Iterable[dict[str, np.nda
     features = {key: value for key, value in dataset_features((256, 256)).items() if key not in omitted}
     dataset = LeRobotDataset.create("local/plain", fps=CONTROL_HZ, features=features, root=out, use_videos=True)
     for demo, images_of_steps in episodes:
-        columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo).columns()}
+        columns = {"observation.state": demo.proprio, "action": demo.actions, **labels(demo)}
         for t, images in enumerate(images_of_steps):
             frame: dict[str, Any] = {image_key(camera): image for camera, image in images.items()}
             for key, column in columns.items():

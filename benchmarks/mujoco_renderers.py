@@ -33,8 +33,7 @@ Draw = Callable[[int], np.ndarray]
 
 def libero_model() -> mujoco.MjModel:
     """Return LIBERO's kitchen with all meshes and textures."""
-    from lerobot_memobench.sim.libero.scene import scene_xml
-    from lerobot_memobench.sim.scene import ARENA_BYTES
+    from lerobot_memobench.sim.scene import ARENA_BYTES, scene_xml
     from lerobot_memobench.tasks.catalogue import get_task
 
     spec = mujoco.MjSpec.from_string(scene_xml(get_task(TASK), visuals=True))

@@ -1,12 +1,11 @@
 """Compare updates and plans of small object-based policies at another commit and at this commit, in turns.
 
-    python benchmarks/object_update.py FOLDER [--rounds 9] [--memory frames bank …] [--words 16] [--compile]
+    python benchmarks/object_update.py FOLDER [--rounds 9] [--memory frames bank …] [--words 16]
 
 FOLDER holds `lerobot_memobench` of the other commit (`git worktree add /tmp/before COMMIT`, then `/tmp/before/src`). An
 update is forward, backward, clipping, AdamW and the weight average on 12 episodes x 6 samples. A plan is one chunk of
 the shipped `memobench_strict` with a full memory. Both sides run in processes of their own, on one thread. Prints a
-Markdown table of median CPU milliseconds and the median ratio before / after. With --compile this commit's updates run
-under policy.compile_model=true; this takes a C++ compiler and minutes, and FOLDER may be this commit too.
+Markdown table of median CPU milliseconds and the median ratio before / after.
 """
 
 from __future__ import annotations
@@ -51,13 +50,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--memory", nargs="+", default=list(MEMORIES))
     parser.add_argument("--words", type=int, default=16)
-    parser.add_argument("--compile", action="store_true")
     args = parser.parse_args()
     print("| | before, ms | after, ms | ratio |\n| --- | ---: | ---: | ---: |")
     for name in (*args.memory, PLAN):
         workers = [
-            Worker(__file__, args.before, name, str(args.words), ""),
-            Worker(__file__, HERE, name, str(args.words), "compiled" * args.compile),
+            Worker(__file__, args.before, name, str(args.words)),
+            Worker(__file__, HERE, name, str(args.words)),
         ]
         for worker in workers * 2:  # the second update still allocates
             worker.ask()
@@ -69,7 +67,7 @@ def main() -> None:
             worker.close()
 
 
-def serve(name: str, words: int, compiled: bool) -> None:
+def serve(name: str, words: int) -> None:
     """Answer each request with the CPU milliseconds of an update or a plan."""
     torch.set_num_threads(1)
     keep_freed_memory()  # as training does
@@ -77,7 +75,7 @@ def serve(name: str, words: int, compiled: bool) -> None:
     if name == PLAN:
         count, work = PLANS_PER_REQUEST, planner(words)
     else:
-        count, work = 1, updater(policy_config(name, compiled), words)
+        count, work = 1, updater(policy_config(name), words)
 
     def measure(_: str) -> list[float]:
         started = time.process_time()
@@ -88,10 +86,9 @@ def serve(name: str, words: int, compiled: bool) -> None:
     answer_requests(measure)
 
 
-def policy_config(memory: str, compiled: bool = False) -> MemobenchMemConfig:
+def policy_config(memory: str) -> MemobenchMemConfig:
     """Return the configuration of a small object-based policy."""
-    compiling = {"compile_model": True, "compile_mode": "default"} if compiled else {}
-    settings = config("small", device="cpu", perception="objects", memory=memory, **compiling)
+    settings = config("small", device="cpu", perception="objects", memory=memory)
     settings.input_features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (SIZE,))
     return settings
 
@@ -163,6 +160,6 @@ def planner(words: int) -> Callable[[], None]:
 
 if __name__ == "__main__":
     if sys.argv[1] == "--serve":
-        serve(sys.argv[2], int(sys.argv[3]), sys.argv[4] == "compiled")
+        serve(sys.argv[2], int(sys.argv[3]))
     else:
         main()

@@ -40,8 +40,8 @@ from numpy.typing import NDArray
 from websockets.sync.server import Server, ServerConnection, serve
 
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.convention import trained_convention
-from lerobot_memobench.policies.remote.transports import pack, unpack
+from lerobot_memobench.policies.compatibility import trained_convention
+from lerobot_memobench.policies.remote_connection import pack, unpack
 from lerobot_memobench.sim.convention import STATED
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation

@@ -32,7 +32,7 @@ from vla_eval.specs import (
 )
 
 from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.convention import trained_convention
+from lerobot_memobench.policies.compatibility import trained_convention
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED, UPRIGHT
 

@@ -1,8 +1,8 @@
 """Evaluations kept in the repository, many in two Parquet tables: their rollouts, and the facts of each.
 
 ``rollouts.parquet`` has a row per rollout: the evaluation's name, and the fields of its line in the log.
-``evaluations.parquet`` has a row per evaluation, or training: its name, its card without episodes (JSON), the command
-and its cost. A name is the path of its folder below the folder that it was kept from.
+``evaluations.parquet`` has a row per evaluation, or training: its name, its ``evaluation.json``, the command and its
+cost. A name is the path of its folder below the folder that it was kept from.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, read_log
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.episode_log import MERGED_FILE, log_text, read_lines
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import draft_of, write_file
-from lerobot_memobench.run.card import with_episodes, write_card
 
 ROLLOUTS, EVALUATIONS = "rollouts.parquet", "evaluations.parquet"
 NAME, FIELDS, CARD, COMMAND = "evaluation", "fields", "card", "command"
@@ -46,10 +45,9 @@ def keep(root: Path, names: Iterable[str], kept: Path) -> None:
         if command.exists():
             row[COMMAND] = json.dumps(json.loads(command.read_text()))
         if folder.is_dir() and not (folder / "meta").is_dir():  # a dataset is kept as its command
-            lines = read_log(folder)
+            lines = read_lines(folder)
             row[FIELDS] = list(dict.fromkeys(key for line in lines for key in line))
-            card = {key: value for key, value in read_evaluation(folder).items() if key != "episodes"}
-            row[CARD] = json.dumps(card) if card else None
+            row[CARD] = json.dumps(read_evaluation(folder))
             rollouts += [{NAME: name, **line} for line in lines]
         evaluations.append(row)
     new = {row[NAME] for row in evaluations}
@@ -90,13 +88,8 @@ def restore(kept: Path, root: Path, names: Sequence[str] | None = None) -> list[
         if row[COMMAND] is not None:
             write_file(root / f"{name}.json", row[COMMAND])
         if name in lines:
-            folder.mkdir(exist_ok=True)
-            write_file(folder / MERGED_FILE, "".join(json.dumps(line) + "\n" for line in lines[name]))
-        card = json.loads(row[CARD] or "{}")
-        if "runs" in card:  # it was whole: its episodes are the log's
-            write_card(folder, with_episodes({**card, "episodes": []}, lines.get(name, [])))
-        elif card:
-            write_file(folder / EVALUATION_FILE, row[CARD])
+            write_evaluation(folder, json.loads(row[CARD]))
+            write_file(folder / MERGED_FILE, log_text(lines[name]))
     return wanted
 
 

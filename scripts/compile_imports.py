@@ -42,8 +42,7 @@ def compile_imports(folders: Iterable[Path]) -> None:
 
 def render() -> None:
     """Step and render a simulation, so that numba compiles and caches its functions, and meshes are cached."""
-    from lerobot_memobench.sim.rendering import QUALITIES, RenderSettings
-    from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, Simulation
+    from lerobot_memobench.sim.simulation import MJCF_CAMERAS, NO_OP, QUALITIES, RenderSettings, Simulation
     from lerobot_memobench.tasks.catalogue import get_task, task_names
 
     for quality in QUALITIES:

@@ -54,14 +54,14 @@ PUBLIC = {
     "Tasks": ("tasks.catalogue", "get_task load_task resolve_tasks task_names find_tasks"),
     "Task": ("tasks.task", "Task Checkpoint Prompt Variant"),
     "Formulas": ("tasks.formula", ""),
-    "Environment": ("envs.memobench_env", "MemobenchEnv"),
-    "Environment configuration": ("envs.configuration_memobench", "MemobenchEnvConfig"),
+    "Environment": ("envs.env", "MemobenchEnv"),
+    "Environment configuration": ("envs.lerobot", "MemobenchEnvConfig"),
     "vla-evaluation-harness": ("vla_eval", "MEMOBench"),
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summary_of report_values wilson"),
     "Comparison": ("evaluation.comparison", "Comparison Contrast compare_evaluations"),
-    "Datasets": ("datasets.lerobot_format.reading", "episodes_where list_episodes read_episode RecordedEpisode"),
+    "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
@@ -142,7 +142,7 @@ def environment_fields() -> Iterator[tuple[str, str, str]]:
         values = ", ".join(code(value) for value in field.metadata["values"] or ())
         default = field.metadata["usual"] or repr(field.default)
         yield field.name, default, f"{field.metadata['meaning']}{f' ({values})' if values else ''}"
-    tree = class_of(SOURCE / "envs" / "configuration_memobench.py", "MemobenchEnvConfig")
+    tree = class_of(SOURCE / "envs" / "lerobot.py", "MemobenchEnvConfig")
     meaning = arguments(ast.get_docstring(tree) or "")
     for node in tree.body:
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id in meaning:
@@ -204,7 +204,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
 def spaces_page() -> str:
     """Return the page of observation and action spaces."""
     from lerobot_memobench import protocol
-    from lerobot_memobench.datasets.lerobot_format.columns import ACTION_NAMES, PROPRIO_NAMES
+    from lerobot_memobench.datasets.layout import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
     from lerobot_memobench.envs.pacing import longest
     from lerobot_memobench.envs.settings import BOTH, EnvSettings
@@ -279,8 +279,8 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
-    from lerobot_memobench.datasets.lerobot_format.columns import MEANINGS, OBJECTS, dataset_features
-    from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+    from lerobot_memobench.datasets.episodes import DemonstrationRecord
+    from lerobot_memobench.datasets.layout import MEANINGS, OBJECTS, dataset_features
     from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
@@ -297,7 +297,9 @@ def dataset_page() -> str:
         "LeRobot adds `task`, `timestamp`, `frame_index`, `episode_index`, `index` and `task_index`.",
         "## Episodes",
         "In `meta/episodes`, and as JSON in `episode_info` of an episode's first frame.",
-        table(["column", "meaning"], [[code(name), meaning] for name, meaning in EpisodeRecord.meanings().items()]),
+        table(
+            ["column", "meaning"], [[code(name), meaning] for name, meaning in DemonstrationRecord.meanings().items()]
+        ),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -314,12 +316,13 @@ def schemas_page() -> str:
         ("Policy of a card", evaluation_file.Policy),
         ("Checkpoint of a card", evaluation_file.Checkpoint),
         ("One start", evaluation_file.Start),
-        ("Episodes of a card", evaluation_file.CardEpisode),
+        ("Settings of a card", evaluation_file.CardSettings),
     ]
     parts = [
         "# Log and card schemas",
-        "Files are validated against these types when they are read. Unknown fields are allowed. `null` is allowed if "
-        "the type includes `None`.",
+        "Files are validated against these types when they are read. `null` is allowed if the type includes `None`. "
+        "A line holds an outcome; settings, inputs and policy are in `evaluation.json` and apply to each line. Lines "
+        "with other fields are skipped, and files of another `format` are refused.",
     ]
     for heading, kind in wanted:
         summary = plain((kind.__doc__ or "").partition("\n\n")[0])
@@ -410,7 +413,7 @@ def fields(tree: ast.ClassDef) -> Iterator[tuple[str, str, str, str]]:
 
 POLICIES = {
     "memobench_mem": ("policies/memobench_mem/configuration_memobench_mem.py", "MemobenchMemConfig"),
-    "memobench_remote": ("policies/remote/configuration_remote.py", "RemoteConfig"),
+    "memobench_remote": ("policies/remote.py", "RemoteConfig"),
 }
 
 

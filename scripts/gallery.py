@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_memobench.io import write_file
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
 

@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.io import draft_of
 from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, VALIDATION_SEED
-from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task
 
 TASK, SEED = "find_the_artichoke_hidden_in_one_of_the_drawers", VALIDATION_SEED + 2

@@ -22,7 +22,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
-from lerobot_memobench.datasets.lerobot_format.manifest import read_manifest
+from lerobot_memobench.datasets.episodes import read_manifest
 from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
@@ -37,7 +37,7 @@ from lerobot_memobench.tasks.task import DRAWN
 TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
-OF_THE_DATA = ("input_features", "output_features", "action_feature_names", "object_classes")
+OF_THE_DATA = ("input_features", "output_features", "object_classes")
 """Settings of a policy that its dataset decides."""
 OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
 """Words of an evaluation's command that a card does not repeat."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.memory_text import subtask_texts
 

@@ -152,14 +152,14 @@ def control_and_planned_step(folder: Path) -> list[Functions]:
 
 def training_step(folder: Path) -> list[Functions]:
     """Trace ``lerobot train`` from the end of its second update to the end of its third, and stop it there."""
-    from lerobot_memobench.training.loop import Run
+    from lerobot_memobench.training.loop import TrainingState
 
     generate(folder)
-    update, trace, count = Run.update, Trace(), 0
+    update, trace, count = TrainingState.update, Trace(), 0
 
-    def count_update(run: Run, batch: dict[str, Any]) -> dict[str, Any]:
+    def count_update(state: TrainingState, batch: dict[str, Any]) -> dict[str, Any]:
         nonlocal count
-        result = update(run, batch)
+        result = update(state, batch)
         count += 1
         if count == 2:
             trace.__enter__()
@@ -168,7 +168,7 @@ def training_step(folder: Path) -> list[Functions]:
             raise SystemExit(0)
         return result
 
-    Run.update = count_update  # type: ignore[assignment,method-assign]
+    TrainingState.update = count_update  # type: ignore[assignment,method-assign]
     policy = ("policy=memobench_mem", "size=small", "perception=objects", "align=semantic", "device=cpu")
     run = (f"dataset={folder}/dataset", "steps=9", "batch_size=12", "num_workers=0", f"output_dir={folder}/train")
     with contextlib.suppress(SystemExit):

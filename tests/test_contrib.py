@@ -17,7 +17,7 @@ from huggingface_hub import hf_hub_download
 from lerobot.envs import factory
 from lerobot.envs import utils as env_utils
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import policy_features, policy_names
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.evaluation.metrics import METRICS

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
 from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.logs import rollout
+from tests.support.logs import rollout, write_log
 
 DEMO = Path(__file__).parents[1] / "examples" / "demo.py"
 HEIGHT, WIDTH = 32, 64
@@ -56,7 +55,7 @@ def evaluate(demo: SimpleNamespace, words: list[str]) -> None:
     records = [
         rollout(demo.STRICT_TASK, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)
     ]
-    write_episodes(folder, records)
+    write_log(folder, records)
     video(folder / "videos" / f"{demo.STRICT_TASK}.1.mp4", 6, 100)  # the first episode with different outcomes
 
 

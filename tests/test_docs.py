@@ -42,7 +42,7 @@ from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.run.settings import read_settings
 from lerobot_memobench.training.command import take_training_options
 from research import kept
-from tests.support.logs import rollout
+from tests.support.logs import rollout, write_log
 from tests.support.scripts import load_script
 
 reference = load_script("docs_reference")
@@ -267,7 +267,7 @@ def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str
 
 def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
     """Keep a log under the name ``one`` in the folder's tables."""
-    episode_log.write_episodes(folder / "logs" / "one", lines)
+    write_log(folder / "logs" / "one", lines)
     kept.keep(folder / "logs", ["one"], folder)
 
 

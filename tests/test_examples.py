@@ -17,9 +17,8 @@ import torch
 
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
-from lerobot_memobench.policies.remote.transports import pack, unpack
+from lerobot_memobench.policies.remote import RemoteConfig, RemotePolicy
+from lerobot_memobench.policies.remote_connection import pack, unpack
 from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.run.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFont
 
-from lerobot_memobench.sim.rendering import RenderSettings
+from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.catalogue import task_names
 from lerobot_memobench.tasks.task import Task
 from tests.support.scripts import load_script

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.datasets.lerobot_format.card import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.datasets.card import FAMILIES, LENGTH_BUCKETS
 from lerobot_memobench.evaluation.metrics import METRICS
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.evaluation.tables import WRITERS
@@ -102,9 +102,9 @@ def test_tables_with_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.syspath_prepend(EXAMPLE)
     example = runpy.run_path(str(EXAMPLE / "tables.py"))
     (run,) = read_runs([logs.evaluation(tmp_path / "a")])
-    changed = replace(run, protocol={**run.protocol, "horizon": 600, "world": "memobench", "suite": "strict"})
+    changed = replace(run, protocol={**run.protocol, "horizon": 600, "suite": "strict"})
     assert example["departures"](changed)[len(example["departures"](run)) :] == [
-        *("suite strict, not published", "world memobench, not libero", "horizon 600, not 1200"),
+        *("suite strict, not published", "horizon 600, not 1200"),
     ]
     report = example["paper_report"]([run])
     text = WRITERS["markdown"](report)

@@ -15,20 +15,27 @@ CODE = """
 import json
 from pathlib import Path
 from lerobot_memobench.cli.lerobot import help_of
-from lerobot_memobench.envs.episode_log import differences
+from lerobot_memobench.envs.episode_log import read_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import Acting, differences, facts_of, write_facts
+from lerobot_memobench.evaluation.comparison import ALLOWED
 from lerobot_memobench.run.card import card_of
 from lerobot_memobench.run.plan import plan_line
+from lerobot_memobench.run.settings import settings_of
 from tests.support.scripts import load_script
 
 line = ["env=memobench", "policy=memobench_random", "episodes=1", "tasks=1"]
 plans = [plan_line([*line, word]) for word in ("dummy=3", "seed=7")]
 one, other = (plan.environment.settings.protocol_block for plan in plans)
+card = card_of(plans[0])
+write_facts(Path("log"), facts_of(plans[0].environment.settings, Acting()))
+write_episodes("log", [{"task": "a", "memory_type": "temporal", "episode": 0, "success": True, "checkpoints": []}])
+(record,) = read_log("log")
 print(json.dumps({
     "help": "dummy=\\n        a setting that nothing applies (default: 0)" in help_of("eval"),
     "reference": [row for row in load_script("docs_reference").environment_fields() if row[0] == "dummy"],
-    "card": card_of(plans[0])["settings"]["env"]["dummy"],
-    "protocol": [one["dummy"], other["dummy"]],
-    "comparison": differences(one, other),
+    "card": [card["protocol"]["dummy"], settings_of(card).env["dummy"]],
+    "record": record["dummy"],
+    "comparison": [*differences(one, other), "dummy" in ALLOWED],
 }))
 """
 
@@ -53,7 +60,7 @@ def test_a_new_field_is_all_that_help_files_and_comparisons_need(tmp_path: Path)
     assert found == {
         "help": True,
         "reference": [["dummy", "0", "a setting that nothing applies"]],
-        "card": 3,
-        "protocol": [3, 0],
-        "comparison": ["dummy: 3 and 0"],
+        "card": [3, 3],
+        "record": 3,
+        "comparison": ["dummy: 3 and 0", True],
     }

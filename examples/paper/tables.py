@@ -12,20 +12,19 @@ from collections.abc import Sequence
 
 from published import RAW, PublishedRow, published_rows
 
-from lerobot_memobench.envs.episode_log import with_omitted
 from lerobot_memobench.envs.settings import PICTURES
+from lerobot_memobench.evaluation.comparison import NOTE
 from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, read_runs
-from lerobot_memobench.evaluation.report import LEADING, NOTE, PAPER_COLUMNS, run_row, wide_columns
+from lerobot_memobench.evaluation.report import LEADING, PAPER_COLUMNS, run_row, wide_columns
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, WRITERS, Cell, Report, Section, Table, percent_text
 from lerobot_memobench.protocol import BY_PAPER, EVALUATION_SEED, HORIZON
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 SETTINGS = {
-    **{"suite": PUBLISHED, WORLD: LIBERO, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True},
+    **{"suite": PUBLISHED, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True},
     **{"horizon": HORIZON, "seed_base": EVALUATION_SEED, **PICTURES},
 }
 """Settings of the paper's evaluations."""
@@ -44,8 +43,8 @@ def departures(run: Run) -> list[str]:
     found = [] if len(tasks) == TASKS else [f"{len(tasks)} of {TASKS} tasks"]
     if counts != {EPISODES}:
         found.append(f"{' to '.join(map(str, sorted({min(counts), max(counts)})))} episodes of each, not {EPISODES}")
-    known = with_omitted(run.protocol)
-    found += [f"{key} {known[key]}, not {value}" for key, value in SETTINGS.items() if known.get(key, value) != value]
+    known = SETTINGS | run.protocol
+    found += [f"{key} {known[key]}, not {value}" for key, value in SETTINGS.items() if known[key] != value]
     return found
 
 

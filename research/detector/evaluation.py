@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from lerobot_memobench.datasets.lerobot_format.card import markdown as table
+from lerobot_memobench.datasets.card import markdown as table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
 from lerobot_memobench.perception.detector import Detections, detections

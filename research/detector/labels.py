@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.objects import DRAWERS, PARTS
 from lerobot_memobench.perception.visual_encoder import SIDE, resized
-from lerobot_memobench.sim.libero.mjcf import known_classes
+from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots, Thing, classes, is_lit
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation

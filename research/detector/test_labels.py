@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.perception.geometry import projected, rays
+from lerobot_memobench.perception.objects import projected, rays
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.labels import MASK, Labeller, kinds

@@ -12,7 +12,7 @@ import torch
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector, detections
-from lerobot_memobench.perception.geometry import projected
+from lerobot_memobench.perception.objects import projected
 from lerobot_memobench.perception.visual_encoder import GRID, SIDE
 from lerobot_memobench.perception.weights import load_detector, save_detector
 from lerobot_memobench.sim.asset import TABLE_TOP

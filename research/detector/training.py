@@ -32,7 +32,7 @@ from lerobot_memobench.perception.detector import (
     PyramidLevel,
     peaks,
 )
-from lerobot_memobench.perception.geometry import projected
+from lerobot_memobench.perception.objects import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.sim.asset import TABLE_TOP

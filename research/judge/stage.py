@@ -28,7 +28,7 @@ AWAY = 0.2
 """Rotation of the arm's first joint that takes the hand away from home, rad."""
 CLEAR, COARSE, FINE = 0.15, 0.006, 0.0005
 """Height above a target from which an object is lowered, and the steps of lowering, m."""
-ARM = len(robot.ARM_JOINTS) + len(robot.FINGER_JOINTS)
+ARM = robot.OTHERS.start
 """Positions of arm and fingers, the first of a state."""
 
 Array = NDArray[np.float64]

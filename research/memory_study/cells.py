@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_memobench.datasets.lerobot_format.layout import INFO_FILE
+from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.command_line import parse_words
 from research.memory_study.commands import Cost, check_training, has_ended, kept_of, run_once, train_once

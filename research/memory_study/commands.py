@@ -129,7 +129,7 @@ def train_once(words: Sequence[str], log: Path, policy: Path, *, at_once: int = 
     Raises:
         MemobenchError: as `run_once`; or there is a checkpoint without the file of its command.
     """
-    from lerobot_memobench.training.resume import TRAIN_CONFIG, last_checkpoint
+    from lerobot_memobench.training.command import TRAIN_CONFIG, last_checkpoint
 
     try:
         config = last_checkpoint(policy) / TRAIN_CONFIG

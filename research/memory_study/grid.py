@@ -120,7 +120,7 @@ class Grid:
         if own := [word for word in words if word in ("--tasks", "--out", "--workers")]:
             raise MemobenchError(f"suite {name!r} has {own[0]} in demonstrations; the study sets it: leave it out")
         _refuse_words(f"suite {name!r}, evaluation", suite.evaluation, (*PLACES, "tasks", "policy"))
-        known = resolve_tasks(suite.tasks or "all", suite.name)
+        known = resolve_tasks(",".join(suite.tasks) or "all", suite.name)
         if unknown := [task for task in suite.ceilings if task not in known]:
             raise MemobenchError(f"suite {name!r} has a ceiling of {unknown[0]}; {nearest(unknown[0], known)}")
 

@@ -11,11 +11,10 @@ from typing import IO, Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import protocol_of_log
 from lerobot_memobench.jobs.threads import PROCESSES
+from lerobot_memobench.run.card import run_facts
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
 from research.memory_study import cells, commands
@@ -26,7 +25,7 @@ from research.memory_study.commands import Cost, has_ended
 from research.memory_study.grid import GRID_FILE, ROLLOUTS, SEALED, TRAINING, Grid, chosen, read_grid
 from research.memory_study.tables import figures_of_rows, tables
 from research.necessity.adversaries import ceiling
-from tests.support.logs import rollout
+from tests.support.logs import card, rollout, write_log
 
 FIND = "find_the_artichoke_hidden_in_one_of_the_drawers"
 BUTTER = "put_only_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -118,7 +117,7 @@ def test_words_choose_cells(grid: Grid) -> None:
 
 def test_ceilings_cover_the_strict_tasks_and_are_exact() -> None:
     suite = read_grid(GRID_FILE).suites["strict"]
-    assert sorted(suite.ceilings) == sorted(resolve_tasks(suite.tasks, "strict"))
+    assert sorted(suite.ceilings) == sorted(resolve_tasks(",".join(suite.tasks), "strict"))
     for task, value in suite.ceilings.items():
         assert value == pytest.approx(100 * ceiling(get_task(task)), abs=0.051)
 
@@ -280,12 +279,11 @@ def evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **mor
     """Let these parts of a cell be evaluated, with so many rollouts each."""
     for part in parts:
         episodes = [rollout_of(episode, part == "evidence", solved) | more for episode in range(rollouts)]
-        write_episodes(cell.evaluation(part), episodes)
-        card = {
-            "protocol": protocol_of_log(episodes),
-            "runs": [{"command": [*cell.carded_words(part), "resume=true"]}],
-        }
-        (cell.evaluation(part) / EVALUATION_FILE).write_text(json.dumps(card))
+        (cell.evaluation(part) / "evaluation.json").unlink(missing_ok=True)
+        folder = write_log(cell.evaluation(part), episodes)
+        protocol = {**read_evaluation(folder)["protocol"], "tasks": [BUTTER], "episodes": rollouts}
+        start = run_facts([*cell.carded_words(part), "resume=true"], 1)
+        write_evaluation(folder, card(protocol, read_evaluation(folder)["policy"], runs=[start]))
     for part in (*parts, TRAINING):
         words = cell.training_words() if part == TRAINING else cell.evaluation_words(part)
         cell.log(part).with_suffix(".json").write_text(json.dumps({**COMMAND, "words": words, "ended": True}))
@@ -364,7 +362,7 @@ def test_inconsistent_results_are_refused(no_memory: Cell, frames: Cell, tmp_pat
         case "log":
             frames.log(ROLLOUTS).with_suffix(".json").write_text('{"ended": true}')
         case "card":
-            (folder / EVALUATION_FILE).unlink()
+            (folder / "evaluation.json").unlink()
         case "row":
             shutil.copytree(no_memory.evaluation(ROLLOUTS), folder, dirs_exist_ok=True)
         case "cut":

@@ -34,9 +34,9 @@ from lerobot_memobench.experts.hand import OPEN, UP
 from lerobot_memobench.experts.travel import opening_direction, release_fixture, rise
 from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.asset import split_class
-from lerobot_memobench.sim.detents import DEAD_CENTRE
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
+from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance

@@ -25,6 +25,13 @@ def shipped_policy(name: str) -> Path:
     return file.parent
 
 
+def records_of(folder: Path) -> list[dict[str, Any]]:
+    """Return the episodes of an evaluation, with its settings."""
+    from lerobot_memobench.envs.episode_log import read_log
+
+    return read_log(folder)
+
+
 def run(program: str, *words: object, folder: Path | None = None) -> tuple[int, str]:
     """Run a command in this process and in a folder; return exit status and output (standard output and errors).
 

@@ -1,8 +1,9 @@
 """Net ``logs``: files of evaluations, field by field.
 
-`lerobot eval` with cheap policies, one command per group of settings. The facts are the fields of the lines of
-``episodes.jsonl``, of ``evaluation.json`` and of ``report.json``; of fields that differ from run to run (times, paths,
-versions, commit) only the type. Batch sizes follow from the number of cores. About 3 CPU minutes.
+`lerobot eval` with cheap policies, one command per group of settings. The facts are the fields of each episode, with
+the settings that the reader of the log adds, of ``evaluation.json`` and of ``report.json``; of fields that differ from
+run to run (times, paths, versions, commit) only the type. Batch sizes follow from the number of cores. About 3 CPU
+minutes.
 """
 
 import json
@@ -12,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from scripts.nets.access import succeed
+from scripts.nets.access import records_of, succeed
 from scripts.nets.store import Facts, Parts, flatten
 
 OBJECTS = "obs_type=environment_state_agent_pos"
@@ -36,7 +37,7 @@ EVALUATIONS = (
 )
 FILES = ("evaluation.json", "report.json")
 UNSTEADY = re.compile(
-    r"(^|\.)(wall_s|written|run|git_commit|runs\.\d+\.(versions|machine|command)\.\w+)$|seconds|_s$|^versions\."
+    r"(^|\.)(wall_s|written|git_commit|runs\.\d+\.(versions|machine|command)\.\w+)$|seconds|_s$|^versions\."
 )
 
 
@@ -50,16 +51,11 @@ def evaluate(words: str, folder: Path) -> Facts:
     out = folder / re.sub(r"\W+", "_", words)
     shutil.rmtree(out, ignore_errors=True)  # of an interrupted run
     succeed("lerobot", "eval", "env=memobench", *words.split(), f"output_dir={out}")
-    lines = {"line": [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]}
     files = {file: json.loads((out / file).read_text()) for file in FILES}
     names = sorted(file.relative_to(out).as_posix() for file in out.rglob("*") if file.is_file())
     found: Facts = {words: {"files": re.sub(r"\.\d+\.jsonl", ".jsonl", " ".join(names))}}
-    for name, records in (
-        lines | {f"{file} episode": content.pop("episodes", []) for file, content in files.items()}
-    ).items():
-        for record in records:
-            episode = f"{words}: {record['task']} {record['episode']}"
-            found.setdefault(episode, {}).update(fields(record, name, out))
+    for record in records_of(out):
+        found[f"{words}: {record['task']} {record['episode']}"] = fields(record, "record", out)
     for name, content in files.items():
         found[words] |= fields(content, name, out)
     return found

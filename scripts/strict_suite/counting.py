@@ -9,8 +9,8 @@ from folders import Setting, StrictTask
 from words import AS_BEGUN, CABINET, COUNTS, DRAWERS, HOME, ORDINALS, PLACES, TIMES, Texts, left_ajar, region, times
 
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.difficulty import difficulty_of_count
 from lerobot_memobench.tasks.formula import And, Atom, Exactly, Formula, Hold, Never, Round, When
+from lerobot_memobench.tasks.task import REPETITIONS
 
 BACK = Region("microwave_init_region", "kitchen_table", ((-0.01, -0.26, 0.01, -0.24),), (pi, pi))
 """Start of the microwave, as in the other task with a microwave. At the published start it overlaps the plate."""
@@ -129,7 +129,7 @@ def _setting(event: Counted, number: int) -> Setting:
         tuple(formula for formula, _ in steps),
         tuple(texts for _, texts in steps),
         f"{asked[0].upper()}{asked[1:]}, coming home after each time, and then rest.",
-        difficulty=difficulty_of_count(number),
+        difficulty=next(name for name, most in REPETITIONS.items() if number <= most),
     )
 
 

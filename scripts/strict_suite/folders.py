@@ -12,9 +12,8 @@ from bddl_text import format_bddl
 from lerobot_memobench.io import write_file
 from lerobot_memobench.tasks.bddl import Region, parse_bddl
 from lerobot_memobench.tasks.catalogue import CATALOGUE_DIR, get_task
-from lerobot_memobench.tasks.difficulty import EASY, Difficulty
 from lerobot_memobench.tasks.formula import Formula, to_lists
-from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, STRICT, Prompt, Task
+from lerobot_memobench.tasks.task import BDDL_FILE, EASY, METADATA_FILE, STRICT, Difficulty, Prompt, Task
 
 LONGEST_ROW = 110
 """Maximum columns of a JSON value on one line."""

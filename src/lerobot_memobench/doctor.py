@@ -19,7 +19,7 @@ from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.protocol import PUBLISHED_MUJOCO
-from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
+from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
 from lerobot_memobench.tasks.catalogue import get_task
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"

@@ -39,25 +39,13 @@ def unsupported_system() -> str:
 
 
 def check_choice(name: str, value: object, known: Sequence[str]) -> None:
-    """Check that the value of a setting is known.
-
-    Args:
-        name: name of the setting.
-        value: its value.
-        known: allowed values.
-
-    Raises:
-        MemobenchError: the value is unknown; the message names the nearest known values.
-    """
+    """Raise `MemobenchError`, which names the nearest known values, for another ``value`` of the setting ``name``."""
     if value not in known:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
-HINTS = {
-    "world": "it was removed: LIBERO's scenes are the only ones",
-    "libero_long": "LIBERO-Long is 'libero_10'",
-}
-"""Word of an earlier version or of a paper -> the hint in place of near words."""
+HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}
+"""Word of a paper -> the hint in place of near words."""
 
 
 def nearest(given: str, known: Iterable[str], count: int = 3) -> str:

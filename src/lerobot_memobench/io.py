@@ -47,11 +47,8 @@ def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a temporary path next to ``path``, which is renamed to ``path`` if the block ends without an error.
 
     Readers see the earlier file or the complete new one, also if several processes write it. The temporary name keeps
-    the suffix of ``path``, by which libraries choose a format.
-
-    Args:
-        path: final path.
-        durable: whether to wait until the disk holds the content, so that a crash of the machine leaves no empty file.
+    the suffix of ``path``, by which libraries choose a format. ``durable`` waits until the disk holds the content, so
+    that a crash of the machine leaves no empty file.
     """
     draft = path.with_name(f".{os.getpid()}-{secrets.token_hex(4)}{DRAFT}{path.name}")
     try:
@@ -88,12 +85,9 @@ def refuse_links(*folders: Path) -> None:
 def file_name(text: object, what: str) -> str:
     """Return a name read from data after checking that it names a file in one folder.
 
-    Args:
-        text: the name.
-        what: its role, for the message: ``the task's name in demo.hdf5``.
-
     Raises:
-        MemobenchError: it is no text, is empty or too long, begins with a dot, or has a separator or control character.
+        MemobenchError: it is no text, is empty or too long, begins with a dot, or has a separator or control character;
+            ``what`` is its role, such as ``the task's name in demo.hdf5``.
     """
     if (
         not isinstance(text, str)
@@ -115,8 +109,7 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     Links to folders are followed. Each folder is read once, so links in a circle end.
 
     Raises:
-        MemobenchError: one of them is a pipe, a device or a broken link, which would block or end its reader; or a
-            folder cannot be read.
+        MemobenchError: one of them is a pipe, a device or a broken link; or a folder cannot be read.
     """
 
     def refuse(error: OSError) -> None:
@@ -165,7 +158,7 @@ def cache_base() -> Path:
 def choose_caches() -> None:
     """Set variables of the environment for a user without a name or a writable home, as in many containers.
 
-    Call it before numba, torch or Hugging Face is imported. Child processes inherit the variables.
+    Call it before numba, torch or Hugging Face is imported.
     """
     if sys.platform == "win32":
         return
@@ -186,7 +179,7 @@ def choose_caches() -> None:
 
 
 def private_folder(shared: str) -> Path:
-    """Return this user's own folder in a folder that all users share, such as ``/tmp``; it is made if it is missing.
+    """Make and return this user's own folder in one that all users share, such as ``/tmp``.
 
     Raises:
         OSError: it cannot be made, or others may write to it. Caches hold code, so it must not be another user's.
@@ -197,21 +190,6 @@ def private_folder(shared: str) -> Path:
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
         raise PermissionError(errno.EPERM, "others may write to this folder", str(folder))
     return folder
-
-
-def as_path(word: str) -> str:
-    """Return a word of a command line with a path that every library recognises.
-
-    A leading ``~/`` is expanded, which shells do not do in quotes or, some of them, after ``key=``. An existing path
-    with a colon becomes absolute, because Arrow and FFmpeg read ``run: 2`` as an address.
-    """
-    key, equals, value = word.partition("=")
-    path = value if equals else word
-    if path.startswith("~/"):
-        path = os.path.expanduser(path)
-    elif ":" in path and os.path.exists(path):
-        path = os.path.abspath(path)
-    return key + equals + path if equals else path
 
 
 def file_hash(path: Path) -> str:
@@ -240,31 +218,26 @@ def disk_refusal(error: BaseException) -> str | None:
 
 @contextlib.contextmanager
 def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
-    """Turn a disk error in writing below ``out`` into a `MemobenchError`.
+    """Turn a disk error in writing below the folder ``out`` into a `MemobenchError`.
 
-    Args:
-        out: folder that is written.
-        kept: end of the message: finished work, and how to continue.
-
-    Raises:
-        MemobenchError: the disk is full or not writable.
+    ``kept`` ends the message: finished work, and how to continue.
     """
     try:
         yield
     except MemobenchError:
         raise
     except Exception as error:  # OSError, or an error of a library in C
-        refusal = disk_refusal(error)
+        refusal, end = disk_refusal(error), kept and f"; {kept}"
         named = getattr(error, "filename", None)
         if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
             raise
         if _output_refuses():
             raise MemobenchError(
-                f"the output of this command cannot be written ({refusal}): send it elsewhere{kept and '; ' + kept}"
+                f"the output of this command cannot be written ({refusal}): send it elsewhere{end}"
             ) from error
         raise MemobenchError(
             f"{out} cannot be written ({refusal}; {in_words(free_bytes(out))} are free there): make room, or name "
-            f"another folder{kept and '; ' + kept}"
+            f"another folder{end}"
         ) from error
 
 
@@ -372,12 +345,7 @@ def packed(path: Path) -> Path:
 
 
 def check_fetched(path: Path) -> None:
-    """Refuse a Git LFS pointer, which a clone without git-lfs has instead of the content, or a folder with one.
-
-    Raises:
-        MemobenchError: naming the first pointer.
-        OSError: a file cannot be read.
-    """
+    """Raise `MemobenchError` for a Git LFS pointer, which a clone without git-lfs has, or for a folder with one."""
     for file in files_below(path) if path.is_dir() else [path]:
         if not file.is_file() or file.stat().st_size > LARGEST_POINTER:
             continue
@@ -392,8 +360,7 @@ def file_bytes(path: Path) -> bytes:
     """Return the content of a file, or of the same file compressed by ``gzip`` if only that exists.
 
     Raises:
-        FileNotFoundError: neither exists.
-        OSError: it cannot be read, is damaged, or is too large unpacked.
+        OSError: neither exists, it cannot be read, is damaged, or is too large unpacked.
         MemobenchError: it is a Git LFS pointer.
     """
     if path.suffix != PACKED and not path.exists() and packed(path).exists():
@@ -414,15 +381,11 @@ def file_bytes(path: Path) -> bytes:
 def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
     """Return the content of a JSON file, which may be compressed (`file_bytes`).
 
-    Args:
-        path: the file.
-        schema: its type.
-        advice: fix, which ends the message.
-        nan: whether NaN and Infinity are allowed, as in logs of a diverged training.
+    ``nan`` allows NaN and Infinity, as in logs of a diverged training.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        MemobenchError: it cannot be read or does not match the schema; the message names the place.
+        MemobenchError: it cannot be read or does not match the schema; the message names the place and the ``advice``.
     """
     try:
         return checked(parsed(file_bytes(path), nan=nan), schema)
@@ -472,7 +435,7 @@ def refusing(as_error: Callable[[str], MemobenchError], of: Path | None = None) 
     because an error in writing, such as a full disk, is not caused by the file.
 
     Args:
-        as_error: returns the error for a library's message, shortened to one line; it adds file and fix.
+        as_error: adds file and fix to a library's message, shortened to one line.
         of: file or folder that is read; if it is a Git LFS pointer, the message names that instead (`check_fetched`).
     """
     try:
@@ -509,8 +472,14 @@ def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
     return f"{start}, expected {' or '.join(alternatives)}"
 
 
+def _expected(error: ErrorDetails) -> str:
+    if (known := EXPECTED.get(error["type"])) is not None:
+        return known.format(**error.get("ctx", {}))
+    return error["msg"].removeprefix("Input should be ").lower()
+
+
 def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
-    """Return path and value of the deepest existing part of a location, which may include names of union members."""
+    # A location may include names of union members, which are no parts of the value.
     text = ""
     for part in location:
         if isinstance(value, Mapping) and part in value:
@@ -520,13 +489,6 @@ def _place(location: Iterable[int | str], value: Any) -> tuple[str, Any]:
         else:
             break
     return cut(text), value
-
-
-def _expected(error: ErrorDetails) -> str:
-    known = EXPECTED.get(error["type"])
-    if known is None:
-        return error["msg"].removeprefix("Input should be ").lower()
-    return known.format(**error.get("ctx", {}))
 
 
 def short(value: Any) -> str:

@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.configuration_memobench import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
-from lerobot_memobench.envs.episode_log import Acting
-from lerobot_memobench.envs.evaluation_file import check_protocol
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.env import MemobenchEnv
+from lerobot_memobench.envs.evaluation_file import Acting, check_facts, facts_of
+from lerobot_memobench.envs.lerobot import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
 from lerobot_memobench.envs.observations import PIXEL_INPUT
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
@@ -31,16 +30,8 @@ from lerobot_memobench.tasks.libero_suites import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 try:
+    from vla_eval import specs
     from vla_eval.benchmarks.base import StepBenchmark, StepResult
-    from vla_eval.specs import (
-        GRIPPER_CLOSE_POS,
-        IMAGE_RGB,
-        LANGUAGE,
-        POSITION_DELTA,
-        ROTATION_AA,
-        STATE_EEF_POS_AA_GRIP,
-        DimSpec,
-    )
 except ImportError as error:
     raise MemobenchError(
         f"vla-evaluation-harness is not installed here ({error}): pip install 'vla-eval>=0.8,<0.9'"
@@ -50,14 +41,7 @@ logger = logging.getLogger(__name__)
 
 NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
 """Camera -> the harness's names of its picture and of its video of the demonstration prompt."""
-STATES, STATE_HISTORY, STEP = "states", "state_history", "step"
-SUCCESS, STEPS_KEY = "success", "n_action_steps"
-DECIDED = {
-    "seed_base": "seed",
-    "prompt_in": "send_video_history",
-    "obs_type": "send_state and send_wrist_image",
-    "mirror": "convention to libero",  # an argument of earlier versions
-}
+DECIDED = {"seed_base": "seed", "prompt_in": "send_video_history", "obs_type": "send_state and send_wrist_image"}
 """Setting of `EnvSettings` -> the argument that determines it."""
 
 
@@ -95,7 +79,7 @@ class MEMOBench(StepBenchmark):
             lower than the horizon, it ends episodes without a log line.
     """
 
-    _ALL_RECORD_FIELDS = frozenset({"reward", SUCCESS, "checkpoints_completed", "action", "state"})
+    _ALL_RECORD_FIELDS = frozenset({"reward", "success", "checkpoints_completed", "action", "state"})
     render_backends = frozenset({"gpu", "cpu"})
 
     @classmethod
@@ -120,12 +104,9 @@ class MEMOBench(StepBenchmark):
         **settings: Any,
     ) -> None:
         super().__init__()
-        for name, number, least in (
-            ("seed", seed, 0),
-            ("history_every", history_every, 1),
-            (STEPS_KEY, n_action_steps, 1),
-        ):
-            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+        for name, number in {"seed": seed, "history_every": history_every, "n_action_steps": n_action_steps}.items():
+            least = int(name != "seed")
+            if type(number) is not int or number < least:
                 raise MemobenchError(f"{name} is {number!r}; expected a whole number from {least} on")
         if seed in SPLITS[SEALED]:
             raise MemobenchError(
@@ -146,7 +127,7 @@ class MEMOBench(StepBenchmark):
         if self._settings.suite == STRICT and replan_steps is None and n_action_steps == 1:
             raise MemobenchError(UNKNOWN_PLAN.format("replan_steps"))
         if planned % n_action_steps:
-            raise MemobenchError(f"replan_steps is {planned}; expected a multiple of {STEPS_KEY}={n_action_steps}")
+            raise MemobenchError(f"replan_steps is {planned}; expected a multiple of n_action_steps={n_action_steps}")
         check_loop(self._settings)
         chosen = str(tasks) if isinstance(tasks, str | int) else ",".join(map(str, tasks))
         selected = MemobenchEnvConfig(tasks=chosen, **asdict(self._settings)).selected()
@@ -158,7 +139,7 @@ class MEMOBench(StepBenchmark):
         policy = {} if label is None else {"type": "vla_eval", "identity": f"vla_eval {label}"}
         self._acting = Acting(policy, PIXEL_INPUT)
         if log_dir is not None:  # fail before the first episode
-            check_protocol(Path(log_dir), self._settings.protocol_block | self._acting.protocol)
+            check_facts(Path(log_dir), facts_of(self._settings, self._acting))
         self._env: MemobenchEnv | None = None
         self._history: dict[str, list[NDArray[Any]]] = {}
 
@@ -167,14 +148,11 @@ class MEMOBench(StepBenchmark):
         return [{"name": name, "suite": memory_type} for name, (memory_type, _) in self._tasks.items()]
 
     def reset(self, task: dict[str, Any]) -> dict[str, Any]:
-        """Start the episode ``task["episode_idx"]``, play its prompt and return the first execution frame.
-
-        Raises:
-            MemobenchError: the episode cannot be run.
-        """
+        """Start the episode ``task["episode_idx"]``, play its prompt and return the first execution frame."""
         if self._env is None or self._env.task != task["name"]:
             self.cleanup()
-            self._env = self._make(self._tasks[task["name"]][1])
+            folder = str(self._tasks[task["name"]][1])
+            self._env = MemobenchEnv(folder, self._settings, log_dir=self._log_dir, acting=self._acting)
         number = int(task.get("episode_idx", 0))
         if self._settings.suite in LIBERO_SUITES and number >= NUM_STATES:
             raise MemobenchError(
@@ -183,9 +161,12 @@ class MEMOBench(StepBenchmark):
         observation, info = self._env.reset(seed=self._settings.seed_base + number)
         self._history = {}
         while "fault" not in info and observation["phase"][0] == PROMPT:
-            step, shows = int(observation[STEP][0]), not self._env.episode.idling
+            step, shows = int(observation["step"][0]), not self._env.episode.idling
             if shows and step % self._history_every == 0:
-                self._remember(observation)
+                for name in self._cameras:
+                    self._history.setdefault(NAMES[name][1], []).append(self._picture(observation, name))
+                if self._send_state:
+                    self._history.setdefault("state_history", []).append(observation["agent_pos"])
             self._env.need_observation(shows and (step + 1) % self._history_every == 0)
             observation, *_, info = self._env.step(np.zeros(ACTION_DIM, np.float32))
         if "fault" in info:
@@ -195,22 +176,8 @@ class MEMOBench(StepBenchmark):
         self._recorder.record_video(_video_frame(observation))
         return observation
 
-    def _remember(self, observation: dict[str, Any]) -> None:
-        """Add a frame of the prompt to the first observation."""
-        for name in self._cameras:
-            self._history.setdefault(NAMES[name][1], []).append(self._picture(observation, name))
-        if self._send_state:
-            self._history.setdefault(STATE_HISTORY, []).append(observation["agent_pos"])
-
-    def _make(self, folder: Path) -> MemobenchEnv:
-        return MemobenchEnv(str(folder), self._settings, log_dir=self._log_dir, acting=self._acting)
-
     def step(self, action: dict[str, Any]) -> StepResult:
-        """Execute the first actions of an answer, or fewer if the episode ends.
-
-        Raises:
-            MemobenchError: the answer has the wrong form, or too few actions.
-        """
+        """Execute the first actions of an answer, or fewer if the episode ends."""
         env, actions = self._running(), _actions(action)
         if len(actions) < self._n_action_steps:
             raise MemobenchError(
@@ -234,19 +201,19 @@ class MEMOBench(StepBenchmark):
 
     def make_obs(self, raw_obs: dict[str, Any], task: dict[str, Any]) -> dict[str, Any]:
         """Return the observation to send; the first one contains the prompt."""
-        found: dict[str, Any] = {
+        sent: dict[str, Any] = {
             "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
             "task_description": self._running().task_description,
-            STEP: raw_obs[STEP],
+            "step": raw_obs["step"],
         }
         if self._send_state:
-            found[STATES] = raw_obs["agent_pos"]
+            sent["states"] = raw_obs["agent_pos"]
         if self._settings.robot_state:
-            found["robot_state"] = raw_obs["robot_state"]
+            sent["robot_state"] = raw_obs["robot_state"]
         if self._history:
-            found |= {**self._history, "episode_restart": True}
+            sent |= {**self._history, "episode_restart": True}
             self._history = {}
-        return found
+        return sent
 
     def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
         picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
@@ -256,36 +223,34 @@ class MEMOBench(StepBenchmark):
         """Return success and the episode's MSR, MUR and MCR; see the class."""
         env = self._running()
         if not step_result.done:
-            logger.warning(
-                "%s: max_steps ended an episode, which is not logged; set horizon instead",
-                env.task,
-            )
+            logger.warning("%s: max_steps ended an episode, which is not logged; set horizon instead", env.task)
         record = env.record()
         values = {metric: rollout_value(record, metric) for metric in PROCESS_METRICS}
-        return {
-            SUCCESS: record[SUCCESS],
-            **{metric: value for metric, value in values.items() if value is not None},
-            "failure": record["failure"],
-        }
+        measured = {metric: value for metric, value in values.items() if value is not None}
+        return {"success": record["success"], **measured, "failure": record["failure"]}
 
     def get_metric_keys(self) -> dict[str, str]:
         """Return the metrics that the harness averages over episodes."""
         process = () if self._settings.suite in LIBERO_SUITES else PROCESS_METRICS
-        return dict.fromkeys((SUCCESS, *process), "mean")
+        return dict.fromkeys(("success", *process), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
         """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and protocol."""
         own = self._settings
         return {"max_steps": longest(own), "suite": own.suite, WORLD: LIBERO, "protocol": own.protocol}
 
-    def get_action_spec(self) -> dict[str, DimSpec]:
+    def get_action_spec(self) -> dict[str, specs.DimSpec]:
         """Return the conventions of an action."""
-        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+        return {"position": specs.POSITION_DELTA, "rotation": specs.ROTATION_AA, "gripper": specs.GRIPPER_CLOSE_POS}
 
-    def get_observation_spec(self) -> dict[str, DimSpec]:
+    def get_observation_spec(self) -> dict[str, specs.DimSpec]:
         """Return the conventions of the observation."""
-        pictures = {NAMES[name][0]: IMAGE_RGB for name in self._cameras}
-        return {**pictures, "language": LANGUAGE, **({"state": STATE_EEF_POS_AA_GRIP} if self._send_state else {})}
+        pictures = {NAMES[name][0]: specs.IMAGE_RGB for name in self._cameras}
+        return {
+            **pictures,
+            "language": specs.LANGUAGE,
+            **({"state": specs.STATE_EEF_POS_AA_GRIP} if self._send_state else {}),
+        }
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Return the action of a real-time tick without an answer: no motion, and the last gripper command."""
@@ -311,19 +276,18 @@ class MEMOBench(StepBenchmark):
 
 def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
     """Return the actions of a model server's answer, (steps, 7)."""
-    found: Any = answer.get("actions", answer.get("action"))
+    given: Any = answer.get("actions", answer.get("action"))
     try:
-        actions = np.array(found, dtype=np.float32, ndmin=2)
+        actions = np.array(given, dtype=np.float32, ndmin=2)
     except (TypeError, ValueError):
         actions = np.empty((0, 0), np.float32)
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise MemobenchError(
-            f"the model server returned actions of shape {np.shape(found)}; expected numbers of shape ({ACTION_DIM},) "
+            f"the model server returned actions of shape {np.shape(given)}; expected numbers of shape ({ACTION_DIM},) "
             f"or (steps, {ACTION_DIM}): end-effector displacement (6) and gripper (1)"
         )
     return actions
 
 
 def _video_frame(observation: dict[str, Any]) -> NDArray[np.uint8]:
-    """Return both cameras side by side."""
     return np.concatenate([*observation["pixels"].values()], axis=1)

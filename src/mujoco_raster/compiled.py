@@ -20,12 +20,13 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function at its first call; cache it on disk if possible."""
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """Compile a function at its first call, with other options of numba if given; cache it on disk if possible."""
+    options = {**_OPTIONS, **options}
     try:
-        made: Any = njit(cache=True, **_OPTIONS)(function)
+        made: Any = njit(cache=True, **options)(function)
     except RuntimeError:  # neither the source folder nor the user's cache folder is writable
-        return njit(**_OPTIONS)(function)
+        return njit(**options)(function)
     _discard_unreadable_index(made._cache._cache_file)
     return made
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.cli.memobench import COMMANDS, main
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.tasks.catalogue import get_task, task_names
+from tests.support.logs import write_log
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -120,19 +120,19 @@ def test_tasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_generate_reports_every_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], solved: int
 ) -> None:
-    from lerobot_memobench.datasets import generation
-    from lerobot_memobench.datasets.generation import Failure, GenerationSummary, TaskSummary
+    from lerobot_memobench.datasets import generate as generation
+    from lerobot_memobench.datasets.generate import EpisodeOutcome, GenerationSummary
     from lerobot_memobench.jobs.processes import Advance
 
     asked: dict[str, object] = {}
 
     def generate(tasks, episodes, out, *, progress, **settings):  # type: ignore[no-untyped-def]
         asked.update(settings, tasks=[task.name for task in tasks], episodes=episodes, out=out)
-        failures = tuple(Failure(TASK, 10_000 + k, "it slipped") for k in range(solved, episodes))
-        for k in range(episodes):
-            progress(Advance(k + 1, episodes, TASK, 10_000 + k, None if k < solved else "it slipped"))
-        row = TaskSummary(TASK, "temporal", episodes, solved, (100,) * solved, failures)
-        return GenerationSummary(out if solved else None, (row,))
+        failures = [None if k < solved else "it slipped" for k in range(episodes)]
+        for k, failure in enumerate(failures):
+            progress(Advance(k + 1, episodes, TASK, 10_000 + k, failure))
+        outcomes = tuple(EpisodeOutcome(TASK, 10_000 + k, 100, failure) for k, failure in enumerate(failures))
+        return GenerationSummary(out if solved else None, (TASK,), outcomes)
 
     monkeypatch.setattr(generation, "generate", generate)
     out = tmp_path / "demos"
@@ -165,7 +165,7 @@ def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
         }
         for k in range(4)
     ]
-    write_episodes(folder, records)
+    write_log(folder, records)
     return str(folder)
 
 
@@ -180,30 +180,6 @@ def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: 
     assert set(found) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
     assert main(["report", a, "--format", "json"]) == 0
     assert json.loads(capsys.readouterr().out)["average"]["SR"] == found["average"]["SR"] == 50.0
-
-
-def test_a_report_is_written_in_several_formats(tmp_path: Path) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", successes=3)
-    out = tmp_path / "out"
-    words = ["--format", "csv", "--format", "json", "--format", "latex"]
-    assert main(["report", a, b, *words, "--out", str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == ["report.json", "report.tex", "tables"]
-    tables = {path.stem: list(csv.DictReader(path.open())) for path in sorted((out / "tables").iterdir())}
-    assert list(tables) == ["failures", "joined", "memory-types", "overview", "prefix"]
-    found = json.loads((out / "report.json").read_text())["evaluations"]
-    row = tables["joined"][0]
-    assert row["task"] == "a_task"
-    for name, figures in found.items():
-        rates, intervals = figures["tasks"]["a_task"], figures["intervals"]["tasks"]["a_task"]
-        for metric in ("SR", "MSR", "MUR"):
-            assert float(row[f"{metric} {name}"]) == rates[metric]
-            assert [float(row[f"{metric} {name} {bound}"]) for bound in ("low", "high")] == intervals[metric]
-        assert row[f"MCR {name}"] == row[f"MCR {name} low"] == ""
-    prefix = tables["prefix"][0]
-    assert [float(prefix[f"c{k} any order"]) for k in (1, 2)] == found["a"]["prefix"]["a_task"]
-    assert [float(prefix[f"c{k} in order"]) for k in (1, 2)] == found["a"]["ordered_prefix"]["a_task"]
-    assert [row["object SR"] for row in tables["overview"]] == ["", ""]
-    assert [float(row["average SR"]) for row in tables["overview"]] == [50.0, 75.0]
 
 
 def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

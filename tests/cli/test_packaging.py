@@ -15,8 +15,7 @@ import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
 
-from lerobot_memobench.sim.rendering import QUALITIES
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, QUALITIES, Simulation
 from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
@@ -113,13 +112,19 @@ def without_ffmpeg(folder: Path) -> str:
     return str(folder / "system")
 
 
-def test_setup_removes_only_its_own_packages(tmp_path: Path) -> None:
-    """The installers and the system's libraries are replaced: no download."""
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Return a folder with the files of setup; installers are to be replaced: no download."""
     for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
-    executable(tmp_path / ".uv/bin/uv", 'echo "$*" >>uv_calls')
     executable(tmp_path / ".venv/bin/memobench", "exit 0")
+    return tmp_path
+
+
+def test_setup_removes_only_its_own_packages(checkout: Path) -> None:
+    tmp_path = checkout
+    executable(tmp_path / ".uv/bin/uv", 'echo "$*" >>uv_calls')
     lock = (ROOT / "requirements.lock").read_text()
     (tmp_path / ".venv/.memobench-lock").write_text(f"dropped-one==1.0 \\\n    --hash=sha256:0\n{lock}")
     executable(tmp_path / ".venv/bin/python", '[ "$1" = -c ] && exit 0; echo "$*" >>calls; exit 1')
@@ -139,12 +144,9 @@ def test_setup_removes_only_its_own_packages(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("may", [True, False])
-def test_setup_lists_system_packages_first(tmp_path: Path, may: bool) -> None:
-    for name in ("requirements.lock", "pyproject.toml", ".python-version", "scripts/setup", *LOCKS[1:]):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        shutil.copy(ROOT / name, tmp_path / name)
+def test_setup_lists_system_packages_first(checkout: Path, may: bool) -> None:
+    tmp_path = checkout
     executable(tmp_path / ".uv/bin/uv", "echo uv >&2")
-    executable(tmp_path / ".venv/bin/memobench", "exit 0")
     executable(tmp_path / ".venv/bin/python", "exit 0")
     executable(tmp_path / "bin/id", f"echo {0 if may else 1000}")
     executable(tmp_path / "bin/sudo", "exit 1")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import os
-import random
 import shlex
 import signal
 import subprocess
@@ -17,18 +15,17 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import av
 import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import UNFINISHED
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.run.card import new_card, run_facts, write_card
 from tests.support import logs, synthetic_dataset
-from tests.support.fake_loop import DRAWER, STOVE, results
+from tests.support.fake_loop import STOVE
 from tests.support.fork_server import Fork, ForkServer
 from tests.support.kills import hashes
 from tests.support.object_dataset import make_object_dataset
@@ -113,9 +110,7 @@ def test_a_second_writer_changes_nothing(
     for name in ("out/notes.json", "out/.1-a.part.evaluation.json", "run/model", "files/a.hdf5"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("of the first run")
-    parts: dict[str, Any] = {"protocol": {"tasks": [STOVE], "episodes": 2}, "policy": {}, "checkpoint": None}
-    started = [run_facts(["lerobot", "eval"], 1)]
-    write_card(Path("out"), new_card(**parts, trained_on=None, task_files={}, settings={}, runs=started))
+    write_evaluation(Path("out"), logs.card({"tasks": [STOVE], "episodes": 2}))
     for name in ("ds/.staging/episodes/.tmp-000000", "html/videos/run", "data"):
         Path(name).mkdir(parents=True)
     Path("html/index.html").write_text(UNFINISHED)
@@ -124,7 +119,7 @@ def test_a_second_writer_changes_nothing(
     for path in dataset.iterdir():
         Path("data", path.name).symlink_to(path)
     Path(".run.lock").touch()
-    EpisodeLog("logged").append(logs.record(STOVE))
+    logs.write_log(Path("logged"), [logs.record(STOVE)])
 
     def files() -> dict[Path, bytes | None]:
         return {path: path.read_bytes() if path.is_file() else None for path in tmp_path.rglob("*")}
@@ -266,15 +261,6 @@ def test_each_command_names_the_way_to_resume(words: list[str], verb: str, monke
 
 @linux
 @pytest.mark.slow
-def test_a_generation_is_ended(tmp_path: Path) -> None:
-    words = ["generate", "--out", "my data", "--tasks", STOVE, "--no-images", "--episodes", "200", "--workers", "2"]
-    job = Job(["-m", COMMANDS["memobench"], *words], tmp_path)
-    job.wait_until(lambda: any((tmp_path / "my data" / ".staging").glob("*/*/*")))
-    assert job.end() == f"memobench: ended by SIGTERM; resume with: {shlex.join(['memobench', *words])}"
-
-
-@linux
-@pytest.mark.slow
 @pytest.mark.parametrize("parts", [False, True])
 def test_an_evaluation_is_ended(tmp_path: Path, parts: bool) -> None:
     words = ["eval", "env=memobench", f"tasks={STOVE}", "obs_type=environment_state_agent_pos", "episodes=40"]
@@ -308,29 +294,16 @@ def test_a_training_is_ended_and_resumed(tmp_path: Path) -> None:
     job.end(processes=1)
 
 
-# --- evaluations killed twenty times at random moments ---
+# --- one evaluation in several ways, and kills of processes with children ---
 
-KILLS = 20
 COMMON = ["env=memobench", "env.videos=-1", "batch_size=2"]
 COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would start for longer than an episode lasts
-TWO = f"tasks={STOVE},{DRAWER}"
-EVALUATIONS = {
-    # Within the horizon the expert reaches the stove's first checkpoint in some episodes.
-    "expert": [TWO, "episodes=6", "horizon=70"],
-    # The random policy draws from a generator of its own; its actions show in the videos.
-    "random": [TWO, "policy=memobench_random", "episodes=6", "horizon=40"],
-    # Each scene with each variant, and a pause within 120 steps.
-    "evidence and pauses": [
-        *("policy=memobench_random", "evidence=true", "referent=random", "episodes=6", "horizon=130", "pause_steps=10"),
-        *("tasks=put_the_butter_into_the_bowl_from_the_prompt_video", "demonstration_prompt=false"),
-    ],
-}
 
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[ForkServer]:
     """Forks of a process with LeRobot: its import takes longer than an episode."""
-    modules = ("lerobot_memobench.envs.memobench_env", "lerobot_memobench.run.run", "lerobot_memobench.cli.lerobot")
+    modules = ("lerobot_memobench.envs.env", "lerobot_memobench.run.run", "lerobot_memobench.cli.lerobot")
     forks = ForkServer(modules)
     yield forks
     forks.close()
@@ -341,80 +314,6 @@ def start(server: ForkServer, out: Path, settings: list[str], resume: bool = Tru
     code = f"from lerobot_memobench.cli.lerobot import main; raise SystemExit(main({words!r}))"
     return server.start(code, out.with_suffix(".txt"))
 
-
-def episodes_in(out: Path) -> int:
-    return len(read_episodes(out)) if has_log(out) else 0
-
-
-def kill_sometime(process: Fork, out: Path, rng: random.Random, run_s: float) -> bool:
-    """Kill a run at a random moment; return whether it was still running.
-
-    A third of the kills fall anywhere in the time that an undisturbed run takes, the others soon after an episode has
-    ended, where the writing is.
-    """
-    before = episodes_in(out)
-    if rng.random() < 1 / 3:
-        deadline = time.monotonic() + rng.uniform(0, run_s)
-    else:
-        while process.poll() is None and episodes_in(out) == before:
-            time.sleep(0.01)
-        deadline = time.monotonic() + rng.choice([0, rng.uniform(0, 0.1), rng.uniform(0, run_s / 4)])
-    while process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    return process.poll() is None and process.kill()
-
-
-def comparable(out: Path) -> list[Any]:
-    """Results without times and names of runs, and the hash of every video's frames."""
-    log, *others = results(str(out))
-    videos = {}
-    for path in sorted((out / "videos").glob("*.mp4")):
-        digest = hashlib.sha256()
-        with av.open(str(path)) as container:
-            for frame in container.decode(video=0):
-                digest.update(frame.to_ndarray(format="rgb24").tobytes())
-        videos[path.name] = digest.hexdigest()
-    return [[{key: value for key, value in line.items() if key != "run"} for line in log], *others, videos]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3 * 3600)
-@pytest.mark.parametrize("name", EVALUATIONS)
-def test_resume_after_twenty_kills_equals_undisturbed_run(server: ForkServer, tmp_path: Path, name: str) -> None:
-    settings, undisturbed, killed = EVALUATIONS[name], tmp_path / "undisturbed", tmp_path / "killed"
-    began = time.monotonic()
-    assert start(server, undisturbed, settings, resume=False).wait() == 0
-    run_s = time.monotonic() - began
-    rng, kills, history = random.Random(f"{settings}"), 0, []
-    while kills < KILLS:
-        process = start(server, killed, settings)
-        if kill_sometime(process, killed, rng, run_s):
-            kills += 1
-            history.append(episodes_in(killed))
-        else:
-            assert process.wait() == 0
-            forget(killed, rng)
-    assert start(server, killed, settings).wait() == 0
-    print(f"{kills} kills of runs that take {run_s:.0f} s; episodes in the log after each: {history}")
-    assert comparable(killed) == comparable(undisturbed)
-    assert not [path for path in killed.rglob("*") if path.name.endswith(".part")]
-
-
-def forget(out: Path, rng: random.Random) -> None:
-    """Take half of the episodes out of a finished evaluation."""
-    records = read_episodes(out)
-    kept = rng.sample(records, len(records) // 2)
-    for file in (out / "episodes.jsonl", *(out / "episodes").glob("*.jsonl")):  # `write_episodes` keeps known lines
-        file.unlink()
-    lost = [record for record in records if record not in kept]
-    from lerobot_memobench.envs.episode_log import write_episodes
-
-    write_episodes(out, kept)
-    for record in lost:
-        (out / "videos" / f"{record['task']}.{record['episode']}.mp4").unlink()
-
-
-# --- one evaluation in several ways, and kills of processes with children ---
 
 WAYS = {
     "three rows": ["batch_size=3"],
@@ -489,30 +388,6 @@ def test_a_generation_with_pictures_and_workers_is_killed_and_continued(tmp_path
         job.wait()
     subprocess.run([sys.executable, *words, str(tmp_path / "killed")], check=True, capture_output=True)
     assert hashes(tmp_path / "killed") == hashes(tmp_path / "whole")
-
-
-@linux
-@pytest.mark.slow
-def test_compilation_is_killed_and_repeated(tmp_path: Path) -> None:
-    code = (
-        "import hashlib\n"
-        "from lerobot_memobench.sim.simulation import Simulation\n"
-        "from lerobot_memobench.tasks.catalogue import get_task\n"
-        "simulation = Simulation(get_task('turn_on_the_stove_and_turn_it_off'))\n"
-        "simulation.reset(7)\n"
-        "print(hashlib.sha256(simulation.render('agentview').tobytes()).hexdigest())"
-    )
-    expected = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "numba")}
-    for files in (1, 2, 5, 8):
-        process = subprocess.Popen([sys.executable, "-c", code], env=environment)
-        while process.poll() is None and len([*tmp_path.rglob("*.nb*")]) < files:
-            time.sleep(0.001)
-        process.kill()
-        process.wait()
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == expected
-    assert len([*tmp_path.rglob("*.nbi")]) > 8
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 from lerobot_memobench.cli import memobench
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.conformance.checks import Outcome, run_checks
+from lerobot_memobench.conformance.checks import PASSED, run_checks
 from lerobot_memobench.conformance.subject import load_subject
 from tests.conformance.conftest import EXAMPLE
 from tests.support.lerobots_trainer import trainer_in_this_process
@@ -46,7 +46,7 @@ def test_trained_example_conforms(example: Path, objects: Path, tmp_path: Path) 
     inputs = json.loads((checkpoint / "config.json").read_text())["input_features"]
     assert set(inputs) == {"observation.state", "observation.environment_state"}
     results = run_checks(load_subject([f"policy={checkpoint}", f"dataset={objects}"], tmp_path))
-    assert {result.outcome for result in results} == {Outcome.PASSED}, results
+    assert {result.outcome for result in results} == {PASSED}, results
 
 
 @pytest.mark.slow

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.demonstration import Demonstration, labels, persistent_rows
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, RecordedEpisode
+from lerobot_memobench.datasets.layout import EXECUTED_ACTION, LANGUAGE, OBJECTS
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
@@ -48,24 +50,13 @@ def make_task() -> MakeTask:
             )
             for k, operation in enumerate(operations)
         )
-        return Task(
+        return replace(
+            get_task(STOVE),
             name=name,
             memory_type=memory_type,  # type: ignore[arg-type]
             family="synthetic",
             language=f"do the {name.replace('_', ' ')}",
-            objects={},
-            fixtures={},
-            regions={},
-            init=(),
-            objects_of_interest=(),
-            goal=Atom("open", ("drawer_0",)),
             checkpoints=checkpoints,
-            prompt=None,
-            variants=(),
-            demo_summary="",
-            folder=Path(name),
-            bddl_text=name,
-            metadata={},
         )
 
     return make
@@ -106,6 +97,14 @@ def make_demo(make_task: MakeTask) -> MakeDemo:
         )
 
     return make
+
+
+def as_recorded(demo: Demonstration) -> RecordedEpisode:
+    """Return a demonstration as `read_episode` would read it."""
+    columns, record = labels(demo), DemonstrationRecord.of(demo)
+    frames = {"states": demo.states, "observation.state": demo.proprio, OBJECTS: demo.objects}
+    frames |= {"action": demo.actions, EXECUTED_ACTION: demo.applied, **columns}
+    return RecordedEpisode(record, frames, record.determined() | {LANGUAGE: persistent_rows(columns)}, 0)
 
 
 def moving_images(length: int, size: int, rng: np.random.Generator) -> np.ndarray:

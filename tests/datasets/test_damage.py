@@ -14,10 +14,10 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole
-from lerobot_memobench.datasets.publish import describe
+from lerobot_memobench.datasets.card import describe
+from lerobot_memobench.datasets.episodes import check_whole
 from lerobot_memobench.datasets.validate import check_description, validate
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.envs.episode_log import read_log
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
@@ -153,7 +153,7 @@ def test_training_names_the_damaged_file(simulated, copy, tmp_path, capsys, kind
     assert ("git lfs pull" in last) == (damage is pointer)
 
 
-@pytest.mark.parametrize("command", ["validate", "describe", "cache", "train"])
+@pytest.mark.parametrize("command", ["validate", "train"])
 def test_earlier_format_is_named_with_its_converter(synthetic, copy, tmp_path, capsys, command):
     root = copy(synthetic)
     info = json.loads((root / "meta" / "info.json").read_text())

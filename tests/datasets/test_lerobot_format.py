@@ -13,13 +13,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_memobench.datasets.demonstration import digest, labels
-from lerobot_memobench.datasets.lerobot_format.assembling import assemble, numeric_stats, write_dataset
-from lerobot_memobench.datasets.lerobot_format.card import card_from_frames, terms
-from lerobot_memobench.datasets.lerobot_format.columns import dataset_features
-from lerobot_memobench.datasets.lerobot_format.layout import is_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.staging import stage_demonstration
+from lerobot_memobench.datasets.episodes import read_episode
+from lerobot_memobench.datasets.layout import dataset_features, is_dataset
+from lerobot_memobench.datasets.stage import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
+from lerobot_memobench.datasets.write import assemble, numeric_stats, write_dataset
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.scene_hash import LIBERO
@@ -39,7 +37,7 @@ def test_frames_are_equal_after_loading(dataset, demos):
     assert (dataset.num_episodes, len(dataset), dataset.fps) == (3, sum(map(len, demos)), 20)
     position = 0
     for number, demo in enumerate(demos):
-        columns = labels(demo).columns() | {"action": demo.actions, "observation.state": demo.proprio}
+        columns = labels(demo) | {"action": demo.actions, "observation.state": demo.proprio}
         assert read_episode(dataset.root, number).columns["states"].tolist() == demo.states.tolist()
         for t in range(0, len(demo), 3):
             item = dataset[position + t]
@@ -65,7 +63,7 @@ def test_every_number_has_a_name(dataset):
 
 
 def test_instructions_are_in_the_present_tense(stove):
-    columns = labels(stove).columns()
+    columns = labels(stove)
     assert set(columns["subgoal.instruction"]) == {"switch the stove on", "switch the stove off again"}
     assert "switched the stove on" in columns["subgoal.intermediate"]
 
@@ -169,10 +167,6 @@ def test_terms_depend_on_scans_and_source(demos, make_task, tmp_path):
         card = DatasetCard.load(root / "README.md")
         assert card.data.license == licence
         assert ("replace missing scans" in card.text) == bool(demo.stand_ins)
-    former = {"task_name": name, "memory_type": "spatial", "seed": 7}
-    assert [terms([{**former, "seed": seed}])[0] for seed in (7, -1)] == ["apache-2.0", "cc-by-nc-4.0"]
-    row = {**former, "length": 30, "exec_start_index": 0, "operations": "S"}
-    assert "version 0.2 modelled in code" in card_from_frames(root, [row])
 
 
 def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path):

@@ -11,14 +11,13 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_edit_dataset as tool
 
+from lerobot_memobench.datasets.card import describe
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO
-from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
-from lerobot_memobench.datasets.lerobot_format.reading import STRANGER, episodes_where, list_episodes, read_episode
-from lerobot_memobench.datasets.publish import describe
-from lerobot_memobench.datasets.validate import Verdict
+from lerobot_memobench.datasets.episodes import STRANGER, episodes_where, list_episodes, read_episode
+from lerobot_memobench.datasets.layout import EPISODE_INFO, MANIFEST_FILE
+from lerobot_memobench.datasets.validate import CheckResult
 from lerobot_memobench.datasets.validate import validate as validation
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
 from tests.datasets.conftest import BUTTER, STOVE
 from tests.support.short_demonstrations import drawn_steps
@@ -38,7 +37,7 @@ def ours(demos, tmp_path_factory) -> Path:
     return write_dataset(demos, tmp_path_factory.mktemp("ours") / "ds", repo_id=REPO)
 
 
-def validate(folder: Path) -> list[Verdict]:
+def validate(folder: Path) -> list[CheckResult]:
     """Return the verdicts on episodes; all files agree, and a note lists omitted checks."""
     found = validation(folder)
     assert [verdict for verdict in found if verdict.of_file and verdict.disagreement] == []
@@ -113,8 +112,8 @@ def test_removed_states_are_compared_by_hash(ours, demos, tmp_path):
     _rewrite(edited, digest(demos[0]), "0" * 64)
     (verdict,) = validate(edited)
     assert str(verdict.disagreement).startswith("digest: recorded '000000")
-    _rewrite(edited, '"variant":0', '"variant":"none"')
-    with pytest.raises(MemobenchError, match=r"episode 0: .*episode_info .*variant"):
+    _rewrite(edited, '"world":"libero"', '"world":"another"')
+    with pytest.raises(MemobenchError, match=r"episode 0: .*episode_info .*world"):
         list_episodes(edited)
 
 

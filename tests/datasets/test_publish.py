@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.datasets.lerobot_format.layout import MANIFEST_FILE
-from lerobot_memobench.datasets.publish import TABLES_FILE, describe, push
+from lerobot_memobench.datasets.card import TABLES_FILE, describe, push
+from lerobot_memobench.datasets.layout import MANIFEST_FILE
 from lerobot_memobench.errors import MemobenchError
 from tests.support import hub_server
 from tests.support.fork_server import ForkServer
 
 REPO = "local/test"
-IMPORTED = ("lerobot_memobench.datasets.publish", "lerobot.datasets.streaming_dataset")
+IMPORTED = ("lerobot_memobench.datasets.card", "lerobot.datasets.streaming_dataset")
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def folder(synthetic, copy):
 
 
 PUSH = """
-from lerobot_memobench.datasets.publish import push
+from lerobot_memobench.datasets.card import push
 from lerobot_memobench.errors import MemobenchError
 try:
     print(push({folder!r}, {repo!r}, notify=lambda text: print("note:", text)))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.datasets.convert import convert
-from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, key_frames
+from lerobot_memobench.datasets.episodes import read_episode
 from lerobot_memobench.datasets.hdf5 import PublishedDemo, PublishedFile
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
 from lerobot_memobench.datasets.restore import joints_of, restore, task_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import ObjectSlots
@@ -86,10 +86,10 @@ def test_variations_of_files(drawer, tmp_path):
     file, found = first(path)
     task = task_of(file, found)
     assert task.bddl_text == drawer.task.bddl_text
-    assert labels(restore(task, found)).key_frames.tolist() == [SHUT - 3]
+    assert key_frames(restore(task, found)).tolist() == [SHUT - 3]
     both = replace(task, checkpoints=task.checkpoints * 2)
     some = restore(both, replace(found, metadata=found.metadata | {"key_frame": [SHUT - 7, -1]}))
-    assert labels(some).key_frames.tolist() == [SHUT - 7, SHUT], "the known one is kept, the other one is evaluated"
+    assert key_frames(some).tolist() == [SHUT - 7, SHUT], "the known one is kept, the other one is evaluated"
     summary = convert(path, tmp_path / "ds")
     assert (summary.exit_status, summary.episodes) == (0, 1)
     assert f"catalogue's {DRAWER}" in str(summary.notes[0])

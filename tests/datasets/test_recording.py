@@ -13,16 +13,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lerobot_memobench.datasets.demonstration import Demonstration, digest, labels
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.reading import read_episode
-from lerobot_memobench.datasets.recording import HOLD_FRAMES
+from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames, labels
+from lerobot_memobench.datasets.episodes import read_episode
+from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, suite_of, task_names
 from lerobot_memobench.tasks.task import STRICT
-from tests.datasets.conftest import STOVE
+from tests.datasets.conftest import STOVE, as_recorded
 from tests.support.short_demonstrations import beginning, record_demonstration
 
 HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -41,12 +41,12 @@ def moved() -> Demonstration:
 
 
 def test_recorded_demonstration(stove):
-    assert replay(stove) is None
-    found = labels(stove)
-    assert (stove.success, stove.exec_start, found.operation[-1]) == (True, 0, -1)
-    assert (found.key_frames >= 0).all()
-    assert (np.diff(found.key_frames) >= 0).all()
-    assert found.key_frames[-1] <= len(stove) - HOLD_FRAMES
+    assert replay(as_recorded(stove)) is None
+    found, completion = labels(stove), key_frames(stove)
+    assert (stove.success, stove.exec_start, found["checkpoint.operation"][-1]) == (True, 0, -1)
+    assert (completion >= 0).all()
+    assert (np.diff(completion) >= 0).all()
+    assert completion[-1] <= len(stove) - HOLD_FRAMES
     # After success the fingers stay closed for some steps, then open.
     np.testing.assert_array_equal(stove.actions[[-HOLD_FRAMES, -1], 6], [1, -1])
     assert np.abs(stove.actions).max() <= 1
@@ -61,20 +61,20 @@ def test_held_frames(name, monkeypatch, tmp_path):
     begins, found = get_task(name).prompt_steps or 0, labels(demo)
     assert demo.success
     assert demo.exec_start == begins
-    np.testing.assert_array_equal(found.step, [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
-    np.testing.assert_array_equal(found.phase, np.arange(len(demo)) >= begins)
-    assert found.held[begins]
-    assert not found.held[:begins].any()
-    starts = np.flatnonzero(np.diff(found.held.astype(int), prepend=0) == 1)
+    np.testing.assert_array_equal(found["observation.step"], [*range(begins), *[NO_CLOCK] * (len(demo) - begins)])
+    np.testing.assert_array_equal(found["observation.phase"], np.arange(len(demo)) >= begins)
+    assert found["held"][begins]
+    assert not found["held"][:begins].any()
+    starts = np.flatnonzero(np.diff(found["held"].astype(int), prepend=0) == 1)
     assert len(starts) > (name == COUNTING)
-    held = np.flatnonzero(found.held[:-1])
+    held = np.flatnonzero(found["held"][:-1])
     assert not demo.applied[held].any()
     assert not demo.actions[held].any()
     for column in (demo.states, demo.proprio, demo.objects, demo.satisfied):
         np.testing.assert_array_equal(column[held], column[held + 1])
     moving = np.setdiff1d(np.arange(begins, len(demo) - 1), held)
     assert (demo.states[moving, 0] < demo.states[moving + 1, 0]).all(), "the time runs where actions have an effect"
-    assert replay(demo) is None
+    assert replay(as_recorded(demo)) is None
     recorded = read_episode(write_dataset([beginning(demo, begins + 30)], tmp_path / "ds"), 0)
     assert replay(recorded) is None
     for frame in (begins, begins + 20, begins + 29):
@@ -94,7 +94,7 @@ def test_perturbed_demonstration(moved, tmp_path):
     assert (off[moved.exec_start : -HOLD_FRAMES, :6].max(axis=1) > 0).mean() > 0.9
     labelled, applied = moved.actions[moved.exec_start :, 6], moved.executed[moved.exec_start :, 6]
     assert (applied <= labelled).all(), "fingers may open early, but do not close early"
-    assert replay(moved) is None
+    assert replay(as_recorded(moved)) is None
     lit = moved.objects.reshape(len(moved), SLOTS, -1)[..., STARTS["highlighted"]].any(axis=1)
     assert lit[: moved.exec_start].any()
     assert not lit[moved.exec_start :].any()
@@ -115,14 +115,13 @@ RECORD = """
 import json
 import sys
 from pathlib import Path
-from lerobot_memobench.datasets.recording import RecordingJob, RecordingSettings
-from lerobot_memobench.datasets.staging import staged
+from lerobot_memobench.datasets.record import RecordingJob, RecordingSettings
 from lerobot_memobench.tasks.catalogue import get_task
 
 task, seed, settings, folder = sys.argv[1:]
 job = RecordingJob(get_task(task), int(seed), RecordingSettings(images=False, **json.loads(settings)), Path(folder))
 job.run()
-made = staged(job)
+made = job.episode()
 print(made.failure or made.info["digest"])
 """
 

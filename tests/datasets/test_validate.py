@@ -22,20 +22,14 @@ from lerobot.datasets.io_utils import load_tasks, write_tasks
 
 from lerobot_memobench.cli import data as commands
 from lerobot_memobench.datasets import statistics
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS
-from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
-from lerobot_memobench.datasets.lerobot_format.columns import image_key
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes, read_episode
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.episodes import read_episode, read_info
+from lerobot_memobench.datasets.layout import image_key
 from lerobot_memobench.datasets.statistics import check_statistics, complete, lacking, measured
-from lerobot_memobench.datasets.validate import Verdict, images_of, replay, validate
+from lerobot_memobench.datasets.validate import CheckResult, images_of, replay, validate
 from lerobot_memobench.datasets.video import ImageHistograms
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.task import LEVELS
-from lerobot_memobench.training.view import Choice, needs_view
-from tests.datasets.conftest import FRAMES
+from tests.datasets.conftest import FRAMES, as_recorded
 from tests.support.short_demonstrations import drawn_steps
 from tests.support.videos import encode_video
 
@@ -128,25 +122,6 @@ def test_every_column_is_compared(simulated, copy):
     assert difference(folder).startswith("task at frame 0: recorded 'put the milk into the bowl'")
 
 
-def test_columns_of_earlier_versions_are_read(simulated, copy):
-    folder, renamed = copy(simulated), {new: old for old, new in EARLIER_COLUMNS.items()}
-    (path,) = (folder / "data").rglob("*.parquet")
-    table = pq.read_table(path).drop_columns(["subgoal.instruction"])
-    pq.write_table(table.rename_columns([renamed.get(name, name) for name in table.column_names]), path)
-    info = json.loads((folder / "meta" / "info.json").read_text())
-    info["features"] = {renamed.get(name, name): feature for name, feature in info["features"].items()}
-    del info["features"]["subgoal.instruction"]
-    (folder / "meta" / "info.json").write_text(json.dumps(info))
-    present, earlier = read_frame_table(simulated), read_frame_table(folder)
-    assert earlier.subgoals == present.subgoals
-    assert set(earlier.subgoals) == set(LEVELS)
-    assert earlier.memory == present.memory
-    assert needs_view(info["features"], Choice(obs_type="pixels"))
-    assert [verdict.disagreement for verdict in validate(folder)] == [None] * len(validate(folder))
-    change(folder, "data/**/*.parquet", "grounded_subgoal", FRAMES + FRAME)
-    assert difference(folder).startswith(f"subgoal.fine at frame {FRAME}")
-
-
 def decoded(path: Path) -> np.ndarray:
     with av.open(str(path)) as container:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)])
@@ -197,7 +172,7 @@ def test_verdicts_of_episodes_and_files(tmp_path, stove):
     folder = write_dataset(demos, tmp_path / "ds")
     news = []
     verdicts = validate(folder, progress=lambda *each: news.append(each))
-    assert verdicts == [Verdict("episode 0", None), Verdict("episode 1", None)]
+    assert verdicts == [CheckResult("episode 0", None), CheckResult("episode 1", None)]
     assert [done for done, *_ in news] == list(range(1, news[0][1] + 1))
     change(folder, "data/**/*.parquet", "checkpoint.index", 5)
     shutil.rmtree(folder / "states")
@@ -211,10 +186,10 @@ def test_verdicts_of_episodes_and_files(tmp_path, stove):
 def test_replay_compares_fields_of_the_episode(stove, simulated, tmp_path):
     satisfied = stove.satisfied.copy()
     satisfied[5] = True
-    found = replay(replace(stove, satisfied=satisfied))
+    found = replay(as_recorded(replace(stove, satisfied=satisfied)))
     assert (found.column, found.frame) == ("checkpoint.completed", 5)
-    assert str(replay(replace(stove, success=False))) == "success: recorded False, replayed True"
-    assert replay(replace(stove, seed=10_001)).column == "states"
+    assert str(replay(as_recorded(replace(stove, success=False)))) == "success: recorded False, replayed True"
+    assert replay(as_recorded(replace(stove, seed=10_001))).column == "states"
     episode = read_episode(simulated, 0)
     assert replay(replace(episode, whole={**episode.whole, "key_frames": [1, 2]})).column == "key_frames"
     columns = {key: value for key, value in episode.columns.items() if key != "states"}
@@ -223,21 +198,6 @@ def test_replay_compares_fields_of_the_episode(stove, simulated, tmp_path):
     for folder, number, named in ((tmp_path, 0, "is no dataset"), (simulated, 99, "no episode 99")):
         with pytest.raises(MemobenchError, match=named):
             read_episode(folder, number)
-
-
-def test_strict_demonstrations_of_an_earlier_version_are_refused(tmp_path, copy):
-    task = get_task("turn_the_stove_on_and_off_a_given_number_of_times")
-    now = write_dataset([drawn_steps(task.name, 10_002, 6)], tmp_path / "now")
-    check_revision(now)
-    idled = write_dataset([drawn_steps(task.name, 10_002, 6, 4)], tmp_path / "idled")
-    without = copy(now)
-    info = json.loads((without / "meta" / "info.json").read_text())
-    del info["features"]["held"]
-    (without / "meta" / "info.json").write_text(json.dumps(info))
-    other_goal = [replace(place, instructions=("turn it on",)) for place in list_episodes(now)]
-    for folder, places in ((idled, None), (without, None), (now, other_goal)):
-        with pytest.raises(MemobenchError, match="generate the demonstrations again"):
-            check_revision(folder, places)
 
 
 # --- statistics ---

@@ -11,24 +11,24 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes, write_episodes
+from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, line_of, read_lines, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from tests.support import logs
 
 
 def record(task: str = "a", episode: int = 0, **changes: Any) -> dict[str, Any]:
-    own = {"replan_steps": None, "prompt_steps": 0, "steps": 100, "scene_hash": "0123456789abcdef", "wall_s": 1.5}
-    return logs.record(task, episode, **own | changes)
+    own = {"prompt_steps": 0, "steps": 100, "scene_hash": "0123456789abcdef", "wall_s": 1.5}
+    return line_of(logs.record(task, episode, **own | changes))
 
 
 def test_records_are_read_back_sorted(tmp_path: Path) -> None:
     log = EpisodeLog(tmp_path)
     assert not (tmp_path / "episodes").exists()
-    written = [record("b", 1), record("b", 0), record("a", 2), record("a", 2, referent="random")]
+    written = [record("b", 1), record("b", 0), record("a", 2)]
     paths = {log.append(item) for item in written}
     assert paths == {tmp_path / "episodes" / f"{task}.{os.getpid()}.jsonl" for task in "ab"}
     problems: list[str] = []
-    assert read_episodes(tmp_path, problems) == [written[2], written[3], written[1], written[0]]
+    assert read_lines(tmp_path, problems) == [written[2], written[1], written[0]]
     assert not problems
 
 
@@ -37,11 +37,11 @@ def test_newest_line_counts_in_any_file(tmp_path: Path, monkeypatch: pytest.Monk
     log.append(record(steps=1))
     monkeypatch.setattr(os, "getpid", lambda: 1)  # sorts before any real process
     log.append(record(steps=2))
-    assert [item["steps"] for item in read_episodes(tmp_path)] == [2]
-    write_episodes(tmp_path, read_episodes(tmp_path))
+    assert [item["steps"] for item in read_lines(tmp_path)] == [2]
+    write_episodes(tmp_path, read_lines(tmp_path))
     monkeypatch.undo()
     log.append(record(steps=3))
-    assert [item["steps"] for item in read_episodes(tmp_path)] == [3]
+    assert [item["steps"] for item in read_lines(tmp_path)] == [3]
 
 
 @pytest.mark.parametrize("removed", [1, 2, 17, 100])
@@ -51,10 +51,10 @@ def test_torn_file_loses_at_most_its_last_record(tmp_path: Path, removed: int) -
     path.write_bytes(path.read_bytes()[:-removed])
     problems: list[str] = []
     left = [0, 1, 2] if removed == 1 else [0, 1]  # the line break alone is no loss
-    assert [item["episode"] for item in read_episodes(tmp_path, problems)] == left
+    assert [item["episode"] for item in read_lines(tmp_path, problems)] == left
     assert [str(path) in problem and "line 3" in problem for problem in problems] == [True] * (removed > 1)
     EpisodeLog(tmp_path).append(record("a", 3))  # a later process with the same id
-    assert [item["episode"] for item in read_episodes(tmp_path)] == [*left, 3]
+    assert [item["episode"] for item in read_lines(tmp_path)] == [*left, 3]
 
 
 @pytest.mark.parametrize(
@@ -66,13 +66,14 @@ def test_torn_file_loses_at_most_its_last_record(tmp_path: Path, removed: int) -
         (json.dumps({**record(), "episode": "0"}).encode(), "episode"),
         (json.dumps(record(checkpoints=[{"operation": "X", "first_step": 1}])).encode(), "checkpoints"),
         (json.dumps(record(task=3)).encode(), "task"),
+        (json.dumps({**record(), "suite": "strict"}).encode(), "suite"),
         (b"\xff\xfe\x00", "line 2"),
     ],
 )
 def test_invalid_lines_are_skipped_and_named(tmp_path: Path, line: bytes, named: str) -> None:
     (tmp_path / "episodes.jsonl").write_bytes(json.dumps(record("b")).encode() + b"\n" + line + b"\n")
     problems: list[str] = []
-    assert [item["task"] for item in read_episodes(tmp_path, problems)] == ["b"]
+    assert [item["task"] for item in read_lines(tmp_path, problems)] == ["b"]
     assert len(problems) == 1
     assert named in problems[0]
 
@@ -80,7 +81,7 @@ def test_invalid_lines_are_skipped_and_named(tmp_path: Path, line: bytes, named:
 def test_folders_without_a_log_and_bad_records_are_errors(tmp_path: Path) -> None:
     for folder, found in ((tmp_path, "no episode log"), (tmp_path / "missing", "not a folder")):
         with pytest.raises(MemobenchError, match=found):
-            read_episodes(folder)
+            read_lines(folder)
         assert not has_log(folder)
     for bad in (
         record(wall_s=float("nan")),
@@ -102,10 +103,10 @@ def test_killed_writer_loses_no_finished_record(tmp_path: Path) -> None:
         "[log.append({**record, 'episode': k}) for k in range(100_000)]"
     )
     writer = subprocess.Popen([sys.executable, "-c", code, str(tmp_path), json.dumps(record())])
-    while not has_log(tmp_path) or len(read_episodes(tmp_path)) < 20:
+    while not has_log(tmp_path) or len(read_lines(tmp_path)) < 20:
         assert writer.poll() is None
     writer.kill()
     writer.wait()
-    episodes = [item["episode"] for item in read_episodes(tmp_path)]
+    episodes = [item["episode"] for item in read_lines(tmp_path)]
     assert len(episodes) >= 20
     assert episodes == list(range(len(episodes)))

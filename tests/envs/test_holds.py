@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.pacing import Pacing, shortest_hold
 from lerobot_memobench.envs.settings import BOTH, EnvSettings
 from lerobot_memobench.protocol import HOLD_MEAN, LONGEST_HOLD, MOST_HOLDS

@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs import episode as episode_module
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import Hand
@@ -23,8 +23,7 @@ from lerobot_memobench.experts.travel import come_home
 from lerobot_memobench.protocol import NO_CLOCK, PROMPT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import STRICT, Task

@@ -15,24 +15,22 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.envs.episode_log import differences
 from lerobot_memobench.envs.evaluation_file import (
-    EARLIER_CARD,
-    EARLIER_PROTOCOL,
     EVALUATION_FILE,
-    WHOLE,
-    check_protocol,
-    protocol_of,
+    FORMAT,
+    Acting,
+    check_facts,
+    facts_of,
+    has_evaluation,
     read_evaluation,
-    write_protocol,
+    write_facts,
 )
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
-from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import STRICT
 
@@ -80,7 +78,7 @@ def test_bad_values_and_unknown_names_are_refused_everywhere(taker: str) -> None
 def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     fields = {each.name: each for each in dataclasses.fields(EnvSettings)}
     assert all(each.metadata["meaning"] for each in fields.values())
-    assert set(SETTINGS) == {WORLD, *fields} - set(NOT_COMPARED)
+    assert set(SETTINGS) == {*fields} - set(NOT_COMPARED)
     config = MemobenchEnvConfig(horizon=5, pause_steps=3, videos=2)
     assert config.gym_kwargs == dataclasses.asdict(config.settings)
     assert (config.horizon, config.pause_steps, config.videos) == (5, 3, 2)
@@ -97,16 +95,13 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
         ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 4}),
         ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
         ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
-        ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED, WORLD: LIBERO}),
+        ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED}),
     ],
 )
 def test_suite_and_protocol_determine_other_settings(asked: dict[str, Any], found: dict[str, Any]) -> None:
     block = EnvSettings(**asked).protocol_block
     assert {name: block[name] for name in found} == found
-    assert (
-        vars(MemobenchEnvConfig(**asked)).items()
-        >= {k: v for k, v in found.items() if k in SETTINGS and k != WORLD}.items()
-    )
+    assert vars(MemobenchEnvConfig(**asked)).items() >= {k: v for k, v in found.items() if k in SETTINGS}.items()
 
 
 def test_upstream_protocol_has_no_controls() -> None:
@@ -196,79 +191,65 @@ def test_averaged_plans_count_as_observed_steps() -> None:
 # --- the file ---
 
 
-def test_omitted_settings_have_their_former_values() -> None:
-    assert differences({"horizon": 5}, {"suite": "published", "horizon": 5}) == []
-    assert differences({"suite": STRICT}, {}) == ["suite: strict and published"]
-    now = EnvSettings(suite=STRICT).protocol_block
-    before = {key: value for key, value in now.items() if key != HOLD}
-    assert differences(before, now) == [f"hold: 0 and {HOLD_MEAN}"]
-    assert differences(now, now) == []
-    assert differences({"tasks": ["a"], "policy": {"sha256": "a"}}, {"tasks": ["b"], "policy": {"sha256": "b"}}) == []
-    found = differences({"tasks": ["a"]}, {"tasks": ["b"]}, extent=True)
-    assert found == ["tasks: a and b"]
-
-
 def test_folder_keeps_one_protocol_and_one_policy(tmp_path: Path) -> None:
-    block = EnvSettings(horizon=5).protocol_block
-    write_protocol(tmp_path, block)
+    settings, acting = EnvSettings(horizon=5), Acting({"type": "act", "identity": "act 1"}, "pixels")
+    facts = facts_of(settings, acting)
+    check_facts(tmp_path / "new", facts)
+    write_facts(tmp_path, facts)
     before = (tmp_path / EVALUATION_FILE).read_bytes()
-    write_protocol(tmp_path, block)
+    write_facts(tmp_path, facts)
     assert (tmp_path / EVALUATION_FILE).read_bytes() == before
-    assert protocol_of(tmp_path) == block
-    assert check_protocol(tmp_path, block)
-    assert not check_protocol(tmp_path / "new", block)
-    write_protocol(tmp_path / "earlier", {key: value for key, value in block.items() if key != SCENE_HASHES})
-    with pytest.raises(MemobenchError, match=r"another protocol .*horizon: 5 and 6"):
-        write_protocol(tmp_path, {**block, "horizon": 6})
-    with pytest.raises(MemobenchError, match=r"another protocol .*scene_hash_version: 1 and 2"):
-        check_protocol(tmp_path / "earlier", block)
-    write_protocol(tmp_path / "of_a_policy", {**block, "policy": {"identity": "a"}})
-    with pytest.raises(MemobenchError, match="another policy"):
-        write_protocol(tmp_path / "of_a_policy", {**block, "policy": {"identity": "b"}})
+    assert read_evaluation(tmp_path) == facts
+    assert facts["protocol"] == {**settings.protocol_block, "inputs": "pixels"}
+    check_facts(tmp_path, facts_of(settings, Acting()))  # what is unknown is no difference
+    for other, named in (
+        (facts_of(EnvSettings(horizon=6), acting), r"another protocol .*horizon: 5 and 6"),
+        (
+            {**facts, "protocol": facts["protocol"] | {SCENE_HASHES: 1}},
+            r"another protocol .*scene_hash_version: 2 and 1",
+        ),
+        (facts_of(settings, Acting({"identity": "b"})), "another policy"),
+    ):
+        with pytest.raises(MemobenchError, match=named):
+            write_facts(tmp_path, other)
 
 
-def test_files_of_earlier_versions_are_merged(tmp_path: Path) -> None:
-    card = {"protocol": {"tasks": ["a"], "episodes": 2, "horizon": 5}, "policy": {"type": "act"}}
-    (tmp_path / EARLIER_CARD).write_text(json.dumps(card))
-    (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 1, "prompt_in": "steps"}))
-    found = read_evaluation(tmp_path)
-    assert found["policy"] == {"type": "act"}
-    assert found["protocol"] == {**card["protocol"], "render_every": 1, "prompt_in": "steps"}
-    earlier = EnvSettings(horizon=5, prompt_in="steps").protocol_block | {SCENE_HASHES: 1, WORLD: FORMER}
-    assert check_protocol(tmp_path, earlier)
-    (tmp_path / EARLIER_PROTOCOL).write_text(json.dumps({"horizon": 5, "render_every": 8}))
-    with pytest.raises(MemobenchError, match="render_every: 8 and 1"):
-        check_protocol(tmp_path, earlier)
-    with pytest.raises(MemobenchError, match="world: memobench and libero"):
-        check_protocol(tmp_path, EnvSettings(horizon=5).protocol_block)
-    card_file = tmp_path / EARLIER_CARD
-    card_file.with_name(f"{EARLIER_CARD}.gz").write_bytes(gzip.compress(card_file.read_bytes()))
-    card_file.unlink()
-    assert read_evaluation(card_file) == card
-
-
-@pytest.mark.parametrize("name", [EVALUATION_FILE, EARLIER_CARD])
-@pytest.mark.parametrize("text", ["", '{"protocol": {"horizon": -3}, "horizon": []}'])
-def test_damaged_file_is_named(tmp_path: Path, name: str, text: str) -> None:
-    (tmp_path / name).write_text(text)
-    with pytest.raises(MemobenchError, match=name.replace(".", r"\.")) as caught:
-        protocol_of(tmp_path)
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("", "JSON"),
+        ('{"format": 3, "protocol": {"horizon": -3}, "policy": {}}', "horizon"),
+        ('{"format": 2, "protocol": {}, "policy": {}}', "format"),
+        ('{"flags": [], "protocol": {}}', "format"),
+    ],
+)
+def test_damaged_and_other_files_are_named(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / EVALUATION_FILE).write_text(text)
+    with pytest.raises(MemobenchError, match=rf"evaluation\.json.*{named}") as caught:
+        read_evaluation(tmp_path)
     assert "\n" not in str(caught.value)
 
 
+def test_a_file_may_be_compressed(tmp_path: Path) -> None:
+    facts = facts_of(EnvSettings(), Acting())
+    (tmp_path / f"{EVALUATION_FILE}.gz").write_bytes(gzip.compress(json.dumps(facts).encode()))
+    assert read_evaluation(tmp_path) == read_evaluation(tmp_path / EVALUATION_FILE) == facts
+
+
 def test_resuming_needs_the_whole_file(tmp_path: Path) -> None:
-    assert read_evaluation(tmp_path) == protocol_of(tmp_path) == protocol_of(tmp_path / "new") == {}
+    assert not has_evaluation(tmp_path)
     for place in (tmp_path, tmp_path / "no.json"):
         with pytest.raises(MemobenchError, match="missing"):
             read_evaluation(place, whole=True)
     start = {"command": [], "batch_size": 1, "versions": {}, "git_commit": None, "machine": {}}
-    parts = {"format": 2, "policy": {}, "checkpoint": None, "trained_on": None, "task_files": {}, "shard": None}
-    whole = {**parts, "protocol": {"tasks": [], "episodes": 0}, "runs": [start], "episodes": []}
+    parts = {"format": FORMAT, "protocol": {"tasks": [], "episodes": 0}, "policy": {}, "written": "", "settings": {}}
+    others = {"checkpoint": None, "trained_on": None, "task_files": {}, "shard": None, "runs": [start]}
+    whole = parts | others
     file = tmp_path / EVALUATION_FILE
     file.write_text(json.dumps(whole))
     assert read_evaluation(tmp_path, whole=True) == whole
-    lacking = [{k: v for k, v in whole.items() if k != key} for key in WHOLE]
-    lacking += [{**whole, "protocol": {"tasks": []}}, {**whole, "runs": [{}]}]
+    lacking = [{k: v for k, v in whole.items() if k != key} for key in others]
+    lacking.append({**whole, "protocol": {"tasks": []}})
     for content in lacking:
         file.write_text(json.dumps(content))
         assert read_evaluation(tmp_path)

@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.video import AHEAD, BAND, LAST_FRAMES, MARGIN, OPERATION_COLOURS, VideoRecorder, annotate
+from lerobot_memobench.envs.video import BAND, LAST_FRAMES, MARGIN, OPERATION_COLOURS, VideoRecorder, annotate
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task
 
@@ -33,9 +33,9 @@ def encoded_directly(path: Path, frames: list[np.ndarray]) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize(("count", "width"), [(1, 128), (AHEAD + 1, 100), (20, 128)])
+@pytest.mark.parametrize(("count", "width"), [(1, 128), (3, 100), (20, 128)])
 def test_video_equals_direct_encoding(tmp_path: Path, count: int, width: int) -> None:
-    """Two recorders share the thread; the caller reuses one buffer; 100 pixels are no multiple of the padding."""
+    """The caller reuses one buffer; 100 pixels are no multiple of the padding."""
     noise = np.random.default_rng(0).integers(0, 256, (2, count, 64, width, 3), np.uint8)
     recorders = [VideoRecorder(tmp_path / "videos" / f"task.{number}.mp4") for number in range(2)]
     buffer = np.empty((64, width, 3), np.uint8)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import Comparison, Contrast, compare_evaluations, comparison_report
 from lerobot_memobench.evaluation.metrics import METRICS, rollout_value
@@ -36,8 +36,7 @@ def folder(path: Path, reached: list[int], task: str = STOVE, operations: str = 
         logs.rollout(task, "temporal", operations, [j < n for j in range(len(operations))], n == len(operations), k)
         for k, n in enumerate(reached)
     ]
-    write_episodes(path, records)
-    return path
+    return logs.write_log(path, records)
 
 
 def test_counted_by_hand(tmp_path: Path) -> None:
@@ -72,7 +71,7 @@ def test_rates_are_those_of_the_report(tmp_path: Path) -> None:
             for k in range(10):
                 done = [bool(value) for value in rng.random(len(operations)) < 0.6]
                 records.append(logs.rollout(task, memory_type, operations, done, all(done), k))
-        write_episodes(tmp_path / name, records)
+        logs.write_log(tmp_path / name, records)
     a, b = read_runs([tmp_path / "a", tmp_path / "b"])
     found = compare_evaluations(a, b)
     for metric in METRICS:
@@ -122,7 +121,7 @@ def test_the_interval_covers_the_truth_about_as_often_as_it_says(tmp_path: Path)
         ({"replan_steps": 20}, "replan_steps: 5 and 20"),
         ({"referent": "random"}, "referent: fixed and random"),
         ({"scene_hash": "another"}, "initial scenes"),
-        ({"seed": 99}, "seed"),
+        ({"first_seed": 1007}, "seed"),
     ],
 )
 def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
@@ -132,7 +131,7 @@ def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
     with pytest.raises(MemobenchError, match=named):
         compared(a, b)
     (name,) = changes
-    assert compared(a, b, allow=["seed_base" if name == "seed" else name]).pairs == 8
+    assert compared(a, b, allow=["seed_base" if name == "first_seed" else name]).pairs == 8
 
 
 @pytest.mark.parametrize(
@@ -146,12 +145,8 @@ def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
     ],
 )
 def test_settings_beside_the_log_count(tmp_path: Path, setting: str, value: Any) -> None:
-    settings = {**logs.SETTINGS, "prompt_in": "steps", "replan_steps": 5}
-    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b")
-    (a / "protocol.json").write_text(json.dumps(settings))
-    if setting == "seed_base":
-        b = logs.evaluation(tmp_path / "b", first_seed=value)
-    (b / "protocol.json").write_text(json.dumps({**settings, setting: value}))
+    changes = {"first_seed": value} if setting == "seed_base" else {setting: value}
+    a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", **changes)
     if setting == "prompt_in":  # the policy's: it may differ, with a note
         assert compared(a, b).notes[0] == "compared although prompt_in: steps and reset"
         return
@@ -163,13 +158,14 @@ def test_another_mujoco_is_named(tmp_path: Path) -> None:
     """By the cards: in the refusal, and as a note where it is allowed."""
     a, b = logs.evaluation(tmp_path / "a"), logs.evaluation(tmp_path / "b", scene_hash="another")
     for each, version in ((a, "3.9.0"), (b, "4.0.0")):
-        card = {"protocol": {}, "runs": [{"versions": {"mujoco": version, "python": "3.12.1"}}]}
-        (each / "card.json").write_text(json.dumps(card))
+        card = logs.card(logs.SETTINGS | {"replan_steps": 5, "tasks": ["one", "two_of_them"], "episodes": 4})
+        card["runs"][0]["versions"] = {"mujoco": version, "python": "3.12.1"}
+        write_evaluation(each, card)
     with pytest.raises(MemobenchError, match=r"a ran under MuJoCo 3.9.0 and b under 4.0.0"):
         compared(a, b)
     (sentence,) = unlike(read_runs([a, b]))
     assert sentence in compared(a, b, allow=["scene_hash"]).notes
-    (b / "card.json").write_text((a / "card.json").read_text())
+    (b / "evaluation.json").write_text((a / "evaluation.json").read_text())
     assert sentence not in compared(a, b, allow=["scene_hash"]).notes
 
 
@@ -181,10 +177,7 @@ def test_two_salts_are_two_draws_of_one_protocol(tmp_path: Path) -> None:
             logs.rollout("t", "object", "S", [True], name == "b", k, referent="drawn", variant=variant, salt=salt)
             for k, variant in enumerate(variants)
         ]
-        write_episodes(tmp_path / name, records)
-        settings = {**logs.SETTINGS, "referent": "drawn", "replan_steps": 5, "salt": salt}
-        (tmp_path / name / "protocol.json").write_text(json.dumps(settings))
-        both.append(tmp_path / name)
+        both.append(logs.write_log(tmp_path / name, records))
     found = compared(*both)
     assert (found.pairs, find(found, "average of memory types", "SR").value) == (2, 1.0)
     assert [note.partition(":")[0] for note in found.notes] == [
@@ -195,11 +188,8 @@ def test_two_salts_are_two_draws_of_one_protocol(tmp_path: Path) -> None:
 
 
 def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
-    settings = {"seed_base": 7, "horizon": 1200, "render": "default", "referent": "fixed"}
     a = logs.evaluation(tmp_path / "a")
-    b = logs.evaluation(tmp_path / "b", scene_hash="another", referent="random", replan_steps=20)
-    (a / "protocol.json").write_text(json.dumps(settings))
-    (b / "protocol.json").write_text(json.dumps({**settings, "horizon": 600, "referent": "random"}))
+    b = logs.evaluation(tmp_path / "b", scene_hash="another", referent="random", replan_steps=20, horizon=600)
     with pytest.raises(MemobenchError) as caught:
         compared(a, b, allow=["render"])
     names = str(caught.value).replace("--allow ", "").rsplit(": ", 1)[1].split()
@@ -209,12 +199,12 @@ def test_all_that_must_be_allowed_is_named_at_once(tmp_path: Path) -> None:
 
 def test_what_cannot_be_paired_is_refused(tmp_path: Path) -> None:
     a = logs.evaluation(tmp_path / "a")
-    write_episodes(tmp_path / "b", [logs.rollout("other", "object", "S", [True], True, 0)])
+    logs.write_log(tmp_path / "b", [logs.rollout("other", "object", "S", [True], True, 0)])
     with pytest.raises(MemobenchError, match="no episode in common"):
         compared(a, tmp_path / "b")
     with pytest.raises(MemobenchError, match="replan_steps"):
         compared(a, tmp_path / "b", allow=["replan_step"])
     for name, operations in (("c", "SU"), ("d", "SC")):
-        write_episodes(tmp_path / name, [logs.rollout("t", "temporal", operations, [True, True], True, 0)])
+        logs.write_log(tmp_path / name, [logs.rollout("t", "temporal", operations, [True, True], True, 0)])
     with pytest.raises(MemobenchError, match="other checkpoints"):
         compared(tmp_path / "c", tmp_path / "d")

@@ -9,12 +9,10 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.report import with_labels_of
-from tests.support.logs import SETTINGS, rollout
+from tests.support.logs import rollout, write_log
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"
 DRAWERS = "check_all_three_drawers_of_the_cabinet"
@@ -39,17 +37,13 @@ def evaluation(
     **settings: Any,
 ) -> str:
     """One rollout per number: that many of its checkpoints were satisfied; with protocol and card."""
-    paused = {"paused_steps": 210} if "pause_steps" in settings else {}
-    paused |= {key: value for key, value in settings.items() if key in MEMORY_CONTROLS}
+    changes = settings | ({"paused_steps": 210} if "pause_steps" in settings else {})
     records = [
-        rollout(task, "temporal", operations, [j < n for j in range(3)], n == 3, k, **paused)
+        rollout(task, "temporal", operations, [j < n for j in range(3)], n == 3, k, **changes)
         for k, n in enumerate(reached)
     ]
-    write_episodes(folder, records)
-    protocol = {**SETTINGS, "replan_steps": 5, **settings, "tasks": [task], "episodes": len(reached)}
     facts = {"type": "memobench_mem", "sha256": policy, "settings": policy_settings or {}}
-    (folder / "card.json").write_text(json.dumps({"protocol": protocol, "policy": facts}))
-    return str(folder)
+    return str(write_log(folder, records, **facts))
 
 
 def rows_of(out: Path) -> dict[tuple[str, str], dict[str, Any]]:
@@ -154,7 +148,7 @@ def test_shuffled_memory_is_compared_checkpoint_by_checkpoint(tmp_path: Path) ->
 def test_a_checkpoint_after_a_missed_one_does_not_count(tmp_path: Path) -> None:
     normal = evaluation(tmp_path / "normal", [0])
     shuffled = evaluation(tmp_path / "shuffled", [3], "b", policy_settings={"align_targets": "shuffled"})
-    write_episodes(tmp_path / "normal", [rollout(STOVE, "temporal", "SUU", [False, True, True], False, 0)])
+    write_log(tmp_path / "normal", [rollout(STOVE, "temporal", "SUU", [False, True, True], False, 0)])
     assert main(["compare", normal, shuffled, "--format", "json", "--out", str(tmp_path)]) == 0
     assert [rows_of(tmp_path)[STOVE, f"c{k}"]["a"] for k in (1, 2, 3)] == [0, 0, 0]
 

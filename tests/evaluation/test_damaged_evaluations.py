@@ -12,23 +12,14 @@ import pytest
 
 from lerobot_memobench.cli.report import ReportFormat, compare, merge, report
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.evaluation_file import EARLIER_PROTOCOL, check_protocol
+from lerobot_memobench.envs.evaluation_file import check_facts, write_evaluation
 from lerobot_memobench.run import rerun as again
-from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.run.plan import earlier_batch_size
 from lerobot_memobench.run.run import resumed_card
 from tests.support import logs, mutations
 
 STOVE, DRAWER = "press_the_stove_button_four_times", "two_of_them"
-SETTINGS: dict[str, Any] = {
-    "seed_base": 7,
-    "referent": "fixed",
-    "demonstration_prompt": True,
-    "horizon": 1200,
-    "replan_steps": 5,
-    "render_every": 1,
-    "oracle_memory": False,
-}
+SETTINGS: dict[str, Any] = {**logs.SETTINGS, "replan_steps": 5}
 
 
 def card_of(folder: Path) -> dict[str, Any]:
@@ -38,19 +29,17 @@ def card_of(folder: Path) -> dict[str, Any]:
         "versions": {"python": "3.12", "mujoco": "3"},
         "git_commit": None,
         "machine": {"cpu": "some", "cores": 2, "gpu": None},
-        "gl": {"GL backend": "egl"},
     }
     records = read_episodes(folder)
-    card = new_card(
+    return logs.card(
         protocol={"tasks": sorted({record["task"] for record in records}), "episodes": 4, **SETTINGS},
         policy={"type": "act", "seed": 7, "settings": {"n_action_steps": 5, "chunk_size": 50}},
         checkpoint={"path": "somewhere", "revision": None, "files": {"model.safetensors": "0" * 64}},
         trained_on={"repo_id": "me/it", "steps": 5},
         task_files={"one": "abc", "two_of_them": "def"},
-        settings={"env": {"tasks": "one,two_of_them"}, "policy": {"type": "act"}, "episodes": 4},
+        settings={"env": {"tasks": "one,two_of_them"}, "policy": {"type": "act"}},
         runs=[start],
     )
-    return with_episodes(card, records)
 
 
 def whole_evaluation(folder: Path, successes: int) -> Path:
@@ -60,8 +49,7 @@ def whole_evaluation(folder: Path, successes: int) -> Path:
     (folder / "episodes").mkdir()
     worker = [json.dumps({**json.loads(line), "written_at": 1.0}) + "\n" for line in lines[:3]]
     (folder / "episodes" / "one.1.jsonl").write_text("".join(worker))
-    (folder / EARLIER_PROTOCOL).write_text(json.dumps(SETTINGS))
-    write_card(folder, card_of(folder))
+    write_evaluation(folder, card_of(folder))
     return folder
 
 
@@ -84,7 +72,7 @@ class Bench:
             (lambda _: merge(self.run, [self.other]), 20),
             (lambda _: resumed_card(self.run, self.card, lambda _: None), 20),
             (lambda _: earlier_batch_size(self.run), 5),
-            (lambda _: check_protocol(self.run, SETTINGS), 5),
+            (lambda _: check_facts(self.run, logs.facts(SETTINGS)), 5),
             (lambda _: self.rerun(), 20),
         ]
 
@@ -112,7 +100,6 @@ def check(tmp_path: Path, files: str, count: int) -> tuple[int, int]:
 
 KINDS = {
     "log": "episodes.jsonl episodes.jsonl episodes/one.1.jsonl",
-    "protocol": "protocol.json",
     "card": "evaluation.json",
 }
 

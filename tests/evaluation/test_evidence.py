@@ -10,14 +10,13 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.html import facts
 from lerobot_memobench.evaluation.metrics import summary_of
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.logs import SETTINGS, rollout
+from tests.support.logs import rollout, write_log
 
 Policy = Callable[[int, int], int | None]
 """Scene and variant -> choice."""
@@ -136,7 +135,7 @@ def test_intervals_of_all_rates_are_over_scenes(tmp_path: Path) -> None:
     for records in (alike, plain):
         none = [{**record, "success": False, "failure": "storage_failure"} for record in records]
         for name, lines in (("a", none), ("b", records)):
-            write_episodes(tmp_path / f"{name}{len(widths)}", lines)
+            write_log(tmp_path / f"{name}{len(widths)}", lines)
         first, second = read_runs([tmp_path / f"{name}{len(widths)}" for name in "ab"])
         low, high = compare_evaluations(first, second, permutations=10).contrasts[0].interval
         widths.append(high - low)
@@ -150,11 +149,8 @@ def test_tasks_of_one_variant_have_no_rate_of_evidence() -> None:
 
 
 def evaluation(folder: Path, policy: Policy) -> str:
-    write_episodes(folder, rollouts("bowl", "object", policy) + rollouts("count", "temporal", policy, chance=None))
-    (folder / "protocol.json").write_text(
-        json.dumps({**SETTINGS, "referent": "drawn", "evidence": True, "replan_steps": 5})
-    )
-    return str(folder)
+    records = rollouts("bowl", "object", policy) + rollouts("count", "temporal", policy, chance=None)
+    return str(write_log(folder, records))
 
 
 def test_the_rate_joins_every_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.evaluation.plots import draw_figures, success_by_gap
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.gap import gaps, longest_gap
-from tests.support.logs import rollout
+from tests.support.logs import rollout, write_log
 
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 HIDING = "find_the_tomato_hidden_in_one_of_the_drawers"
@@ -47,6 +46,6 @@ def test_checkpoints_are_grouped_by_gap() -> None:
 
 def test_figure_is_drawn_for_tasks_of_the_catalogue(tmp_path: Path) -> None:
     records = [rollout(HIDING, "spatial", "SUC", [True, k > 1, k > 2], k > 2, k) for k in range(4)]
-    write_episodes(tmp_path / "log", records)
+    write_log(tmp_path / "log", records)
     files = draw_figures(read_runs([tmp_path / "log"]), tmp_path)
     assert {"gap.pdf", "gap.png"} <= {file.name for file in files}

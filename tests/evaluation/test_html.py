@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import (
@@ -31,6 +31,7 @@ from lerobot_memobench.evaluation.html import (
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
+from tests.support.logs import write_log
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
@@ -52,7 +53,7 @@ def record(task: str = STOVE, episode: int = 0, *, success: bool = True, **chang
 
 
 def evaluation(folder: Path, records: list[dict[str, Any]]) -> Path:
-    write_episodes(folder, records)
+    write_log(folder, records)
     return folder
 
 
@@ -97,16 +98,18 @@ def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
         "execution_failure": 0,
     }
     protocol = f"published suite, referent fixed, seeds 7 to 10, 4 episodes of {STOVE}"
-    assert run["headline"] == f"policy not recorded: {protocol}; inputs: not recorded"
-    assert run["facts"] == ["4 rollouts"]
+    assert run["headline"] == f"policy not recorded: {protocol}; inputs: not recorded, prompt in steps (observed)"
+    assert run["facts"] == ["4 rollouts", "horizon 1200"]
     assert run["commands"] == []
 
 
 def test_a_result_card_tells_policy_horizon_and_command(tmp_path: Path) -> None:
     evaluation(tmp_path, [record()])
     command = ["lerobot", "eval", "env=memobench", "output_dir=a folder"]
-    card = {"protocol": {"horizon": 200}, "policy": {"type": "memobench_random"}, "runs": [{"command": command}]}
-    (tmp_path / "card.json").write_text(json.dumps(card))
+    protocol = {**logs.SETTINGS, "tasks": [STOVE], "episodes": 1, "horizon": 200}
+    card = logs.card(protocol, {"type": "memobench_random"})
+    card["runs"][0]["command"] = command
+    write_evaluation(tmp_path, card)
     run = page_data(read_runs([tmp_path]), [{}], {})["runs"][0]
     assert run["headline"].startswith("memobench_random: ")
     assert run["facts"][-1] == "horizon 200"

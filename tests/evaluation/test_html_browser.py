@@ -17,13 +17,12 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.evaluation.html import write_html
 from lerobot_memobench.policies.memory_reads import reads_file, write_reads
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
-from tests.support.logs import record
+from tests.support.logs import record, write_log
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -74,12 +73,12 @@ def film(path: Path, frames: int) -> None:
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs: `mine` with films of the first stove and butter rollouts, `other` with one of a shorter stove."""
     root = tmp_path_factory.mktemp("report with spaces & #signs")
-    write_episodes(root / "mine", RECORDS)
+    write_log(root / "mine", RECORDS)
     film(root / "mine" / "videos" / f"{STOVE}.0.mp4", 41)
     film(root / "mine" / "videos" / f"{BUTTER}.0.mp4", 36)
     write_reads(reads_file(root / "mine", BUTTER, 0), {"seed": 7, "referent": "fixed", "chunks": [*READ]})
     write_reads(reads_file(root / "mine", STOVE, 2), {"seed": 9, "referent": "fixed", "chunks": [*SLOTS]})
-    write_episodes(
+    write_log(
         root / "other",
         [
             rollout(STOVE, 0, [("S", None, None), ("U", None, None)], failure="storage_failure", steps=25),
@@ -317,7 +316,7 @@ def test_keys(browser: Any, report: Path) -> None:
 
 def test_long_lists_are_filled_on_demand(browser: Any, tmp_path: Path) -> None:
     records = [rollout(STOVE, k, [("S", 10, 10), ("U", 30, 30)]) for k in range(1500)]
-    write_episodes(tmp_path / "run", records)
+    write_log(tmp_path / "run", records)
     write_html([tmp_path / "run"], tmp_path / "out")
     page = tmp_path / "out" / "index.html"
     show(browser, page, "view=episodes")
@@ -336,7 +335,7 @@ def test_side_by_side_opens_on_a_pair_that_ends_differently(browser: Any, tmp_pa
     failed = {"failure": "storage_failure", "steps": 25}
     for name, last in (("mine", {}), ("other", failed)):
         ends = ({}, {}, last)
-        write_episodes(tmp_path / name, [rollout(STOVE, k, [("S", 10, 10)], **end) for k, end in enumerate(ends)])
+        write_log(tmp_path / name, [rollout(STOVE, k, [("S", 10, 10)], **end) for k, end in enumerate(ends)])
     write_html([tmp_path / "mine", tmp_path / "other"], tmp_path / "page")
     for chosen, episode in (("", 2), (f"&ep={STOVE}.1", 1)):
         show(browser, tmp_path / "page" / "index.html", f"view=compare{chosen}")
@@ -444,7 +443,7 @@ def test_the_page_cannot_reach_the_network(chrome: Any, report: Path) -> None:
 
 def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> None:
     own = {"memory_type": "libero_object", "suite": "libero_object", "convention": "libero"}
-    write_episodes(
+    write_log(
         tmp_path / "run",
         [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")],
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lerobot_memobench.datasets.recording import RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.record import RecordingSettings, compiled_episode, record
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import plan_of
 from lerobot_memobench.experts.fixtures import close_drawer, open_drawer
@@ -18,9 +18,8 @@ from lerobot_memobench.experts.travel import Held
 from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.difficulty import degree_of
 from lerobot_memobench.tasks.formula import Atom
-from lerobot_memobench.tasks.task import Task
+from lerobot_memobench.tasks.task import Task, horizon_of
 from tests.experts.test_expert import play
 from tests.support.libero import simulate
 
@@ -65,16 +64,6 @@ def test_plan_puts_objects_before_closing() -> None:
     assert plan.index("in top") < plan.index("close top")
 
 
-BOWL_SLIPS, BEHIND_BOTTLE, HOLD_IN_PROMPT, BESIDE_CARTON = (
-    (BOWL, 10_027),
-    (MILK, 20_034),
-    (WASTE, 20_043),
-    (WASTE, 10_016),
-)
-"""Seeds of fixed failures: a bowl tipped by the grasp, a carton behind a bottle, a prompt that ended too early, and one
-that was cut because the flange met a carton again and again."""
-
-
 @pytest.mark.parametrize(
     ("name", "variant"),
     [
@@ -83,21 +72,18 @@ that was cut because the flange met a carton again and again."""
     ],
 )
 def test_solves_a_task_of_each_family(name: str, variant: int) -> None:
-    assert not play(get_task(name).variant(variant), 20_000, prompt=True).faults
+    play(get_task(name).variant(variant), 20_000, prompt=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "seed"), [BEHIND_BOTTLE, BOWL_SLIPS, HOLD_IN_PROMPT, BESIDE_CARTON])
-def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
-    played = play(get_task(name), seed, prompt=True)
-    assert not played.faults
-    assert name != MILK or played.episode.exec_steps < 500, "it tried the unreachable low grasp repeatedly"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "seed"),
-    [
+FAILED_ONCE = {
+    "fixed": [
+        (BOWL, 10_027),  # the grasp tipped the bowl
+        (WASTE, 20_043),  # the prompt ended too early
+        (WASTE, 10_016),  # the prompt was cut because the flange met a carton again and again
+    ],
+    # The hand slipped off a bar or off butter at the limit of reach, met what stands in front of a drawer, or carried
+    # the milk carton up.
+    "random": [
         (DRAWERS, 20_003),
         (ARTICHOKE, 20_009),
         (BROCCOLI, 20_008),
@@ -110,11 +96,21 @@ def test_solves_seeds_that_once_failed(name: str, seed: int) -> None:
         (BROCCOLI, 20_204),
         (ARTICHOKE, 20_206),
     ],
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "seed", "referent"), [(*each, referent) for referent, seeds in FAILED_ONCE.items() for each in seeds]
 )
-def test_solves_seeds_in_liberos_scenes_that_once_failed(name: str, seed: int) -> None:
-    """The hand slipped off a bar or off butter at the limit of reach, met what stands in front of a drawer, or carried
-    the milk carton up."""
-    assert not play(get_task(name), seed, prompt=True, referent="random").faults
+def test_solves_seeds_that_once_failed(name: str, seed: int, referent: str) -> None:
+    play(get_task(name), seed, prompt=True, referent=referent)
+
+
+@pytest.mark.slow
+def test_takes_an_unreachable_low_grasp_once() -> None:
+    """The carton stands behind a bottle."""
+    assert play(get_task(MILK), 20_034, prompt=True).exec_steps < 500
 
 
 def test_opens_the_lowest_drawer_without_touching_the_table() -> None:
@@ -215,6 +211,6 @@ def test_visits_home_between_events() -> None:
 @pytest.mark.parametrize("name", task_names(suite="strict"))
 def test_solves_every_variant(name: str) -> None:
     base = get_task(name)
-    horizon = degree_of("extreme").horizon  # the largest counts
-    faults = [play(base.variant(k), 20_000 + k, prompt=True, horizon=horizon).faults for k in range(base.num_variants)]
-    assert not any(faults)
+    horizon = horizon_of("extreme")  # the largest counts
+    for k in range(base.num_variants):
+        play(base.variant(k), 20_000 + k, prompt=True, horizon=horizon)

@@ -44,26 +44,24 @@ def test_folding_leaves_tokens_as_they_were() -> None:
 
 
 @torch.no_grad()
-def test_a_detector_comes_back_from_its_file(tmp_path: Path) -> None:
+def test_a_detector_comes_back_from_its_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     detector, images = Detector(trained_a_little(small_encoder()), ("cork", "cap")), torch.rand(2, 3, SIDE, SIDE)
     before = all_outputs(detector.eval()(images))
     save_detector(detector, tmp_path / "detector.safetensors")
     back = load_detector(tmp_path / "detector.safetensors")
     assert back.kinds == ("cork", "cap")
+    assert not caplog.messages, "only the package's was trained on other scenes"
     assert all(map(partial(torch.allclose, atol=0.05), all_outputs(back(images)), before))
     for name, value in detector.state_dict().items():
         assert torch.equal(back.state_dict()[name], value.bfloat16().float()), name
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(MemobenchError, match="there is no file"):
-        load_detector(tmp_path / "none.safetensors")
-    (tmp_path / "text.safetensors").write_text("text")
-    with pytest.raises(MemobenchError, match="holds no detector"):
-        load_detector(tmp_path / "text.safetensors")
-    save_file({"weight": torch.zeros(2)}, tmp_path / "other.safetensors")
-    with pytest.raises(MemobenchError, match="holds no detector"):
-        load_detector(tmp_path / "other.safetensors")
+    (tmp_path / "text").write_text("text")
+    save_file({"weight": torch.zeros(2)}, tmp_path / "other")
+    for name, problem in (("none", "there is no file"), ("text", "holds no detector"), ("other", "holds no detector")):
+        with pytest.raises(MemobenchError, match=problem):
+            load_detector(tmp_path / name)
 
 
 def test_uncertainties_are_of_the_image_and_of_metres() -> None:

@@ -21,11 +21,11 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
 from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training import loop
-from lerobot_memobench.training.configuration import complete
+from lerobot_memobench.training.command import complete_training
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 TASK = "fold the towel"
@@ -74,7 +74,7 @@ def train(root: Path, out: Path, *flags: str, size: str = "tiny") -> Path:
         "--policy.push_to_hub=false",
     ]
     asked = read_words("train", parse_words([*own, *usual, *flags]))
-    loop.train(complete(asked.build(), asked))
+    loop.train(complete_training(asked))
     return out / "checkpoints" / "last" / "pretrained_model"
 
 
@@ -105,7 +105,7 @@ def test_datasets_of_other_robots(
         assert found.shape == (1, action)
         assert found.isfinite().all()
     assert config.memory_camera == next(iter(cameras))
-    stored = [frame.step for frame in policy.rollout.rows[0].memory[0]]
+    stored = [frame.step for frame in policy.rollout.envs[0].memory[0]]
     assert stored == [*range(0, 5, config.memory_stride)]
 
 
@@ -158,10 +158,10 @@ def test_states_longer_than_the_base_weights_are_refused() -> None:
 
 
 def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Frames.capacity == 8192
-    monkeypatch.setattr(Frames, "capacity", 16)
+    assert FrameSampling.capacity == 8192
+    monkeypatch.setattr(FrameSampling, "capacity", 16)
     spec = MemorySpec(dim=2, tokens=1, width=2, expert=2, grid=0, stride=1)
-    mechanism = Frames(spec, torch.nn.Identity(), Frames.Settings(frames=4))
+    mechanism = FrameSampling(spec, torch.nn.Identity(), FrameSampling.Settings(frames=4))
     state = mechanism.init(1)
     with caplog.at_level(logging.WARNING):
         for step in range(50):
@@ -185,6 +185,3 @@ def test_evaluation_between_updates_needs_the_datasets_inputs(
     words = ("policy=act", "policy.pretrained_backbone_weights=null", "env=memobench", "steps=1", "device=cpu")
     assert main(["train", *words, f"dataset={root}", f"output_dir={tmp_path / 'run'}"]) == 2
     assert re.search(f"{root}.*128 x 128", capsys.readouterr().err)
-
-
-# --- another environment ---

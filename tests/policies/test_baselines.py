@@ -9,7 +9,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.baselines.configuration_baselines import (
+from lerobot_memobench.policies.baselines import (
     MemobenchBlindConfig,
     MemobenchExpertConfig,
     MemobenchRandomConfig,

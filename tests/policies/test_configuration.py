@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,9 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 import lerobot_policy_memobench  # noqa: F401  (registers the environment)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem import configuration_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     MEMORY,
     MEMORY_FUSIONS,
@@ -57,14 +54,6 @@ def test_defaults_of_each_memory() -> None:
         assert made.memory_settings == vars(read_settings(name, {}))
     without = config(memory="none")
     assert (without.memory_fusion, without.memory_settings) == (None, {})
-
-
-def test_fields_of_lerobots_main_are_not_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """LeRobot 0.6.1 would refuse them in a checkpoint."""
-    monkeypatch.setattr(configuration_memobench_mem, "PI05_ALONE", ("compile_mode",))
-    config().save_pretrained(tmp_path)
-    assert "compile_mode" not in json.loads((tmp_path / "config.json").read_text())
-    assert PreTrainedConfig.from_pretrained(tmp_path) == config()
 
 
 @pytest.mark.parametrize(("fields", "last"), [({"size": "tiny"}, 1.0), (OBJECTS, 0.02)])
@@ -116,12 +105,13 @@ def test_recipe_has_the_papers_values(memory: str) -> None:
         ({"memory": "keyframes", "align": "semantic"}, "memory=keyframes"),
         ({"memory": "bank", "align": "framewise"}, "memory=bank"),
         ({"memory_stride": 0}, "memory_stride=0"),
+        ({"chunk_size": 4, "n_action_steps": 5}, "n_action_steps=5.* 4 actions"),
+        ({"n_obs_steps": 2}, "n_obs_steps=2"),
         ({"frames_per_episode": 0}, "frames_per_episode=0"),
         ({"ema_decay": 1.0}, "ema_decay=1.0"),
         ({"ema_decay": float("nan")}, "ema_decay=nan"),
         ({"task_weights": {"prompted": -1.0}}, "task_weights"),
         (OBJECTS | {"detection_noise": -1.0}, "detection_noise=-1.0"),
-        ({"image_resolution": (100, 100)}, "image_resolution.*48"),
     ],
 )
 def test_bad_values_are_refused(fields: dict[str, Any], named: str) -> None:
@@ -135,12 +125,11 @@ def used_if(feature: str) -> list[str]:
 
 @pytest.mark.parametrize(
     ("name", "fields"),
-    [(name, OBJECTS) for name in ("visual_encoder", "image_resolution", "empty_cameras")]
+    [("visual_encoder", OBJECTS)]
     + [(name, {"size": "tiny"}) for name in ("max_state_dim", *used_if("perception=objects"))]
-    + [("image_resolution", {"size": "small"})]
-    + [(name, {"memory": "none"}) for name in (*used_if("a memory"), "memory_phase", "memory_repeats")]
+    + [(name, {"memory": "none"}) for name in (*used_if("a memory"), "memory_phase")]
     + [(name, OBJECTS) for name in used_if("objective=flow_matching")]
-    + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals", "scheduler_decay_lr", "n_obs_steps")],
+    + [(name, {}) for name in ("text_encoder", "subgoal_level", "subgoals")],
 )
 def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) -> None:
     plain = config(**fields)
@@ -157,10 +146,10 @@ class OneMore(MemobenchMemConfig):
 
 
 def test_a_setting_is_one_field() -> None:
-    assert OneMore(device="cpu", repetitions=2, colour="red").fixed_by_training[-2:] == ("repetitions", "colour")
+    assert {"repetitions", "colour"} <= {*OneMore(device="cpu", repetitions=2, colour="red").fixed_by_training}
     for fields, named in (
-        ({"repetitions": 2, "memory": "none"}, "repetitions=2 has no effect: only a memory reads it"),
-        ({"repetitions": 0}, "repetitions=0 is out of range"),
+        ({"repetitions": 2, "memory": "none"}, "repetitions=2.*memory"),
+        ({"repetitions": 0}, "repetitions=0"),
         ({"colour": "rd"}, "colour 'rd'.*red"),
     ):
         with pytest.raises(MemobenchError, match=named):
@@ -186,7 +175,6 @@ OTHERS: dict[str, Any] = {
     "task_weights": {"prompted": 9.0},
     "detector": "no such file",
     "visual_encoder": "no such encoder",
-    "image_resolution": (144, 144),
     "object_classes": ["knob"],
     "memory_fusion": "context",
     "memory_settings": {"no_such": 1},
@@ -194,7 +182,6 @@ OTHERS: dict[str, Any] = {
     "subgoal_level": "coarse",
     "text_encoder": "labels",
     "memory_camera": "observation.images.no_such",
-    "rtc_config": RTCConfig(),
 }
 
 

@@ -11,16 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pytest
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
-import lerobot_memobench.envs
 import lerobot_memobench.registration  # noqa: F401
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.policies.compatibility import chosen_convention
 from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import plan_line, with_names
 from lerobot_memobench.run.settings import read_settings
@@ -64,19 +62,15 @@ def outcome(path: Path, asked: str | None) -> str:
     ("cameras", "training", "expected"),
     [
         (THEIRS, {}, "libero"),
-        (THEIRS, {"repo_id": "me/kitchen"}, "libero"),
         (NUMBERED, {"repo_id": "me/kitchen", "rename_map": RENAMED_LIBERO}, "libero"),
         (NUMBERED, {"step": RENAMED_LIBERO}, "libero"),
         (NUMBERED, {"step": RENAMED}, "upright"),
         (("image", "empty_camera_0"), {"repo_id": "HuggingFaceVLA/libero"}, "libero"),
-        (NUMBERED, {"repo_id": "lerobot/libero_object_image"}, "libero"),
         (OURS, {"repo_id": "physical-intelligence/libero"}, "libero"),
         (NUMBERED, {"repo_id": "me/my_LIBERO_subset"}, "libero"),
         (OURS, {}, "upright"),
-        (OURS, {"repo_id": "memobench/memobench"}, "upright"),
         (NUMBERED, {"repo_id": "local/demos", "rename_map": RENAMED}, "upright"),
         (NUMBERED, {}, None),
-        (("image",), {}, None),
         (("front", "top"), {"repo_id": "me/kitchen"}, None),
         (OURS, {"repo_id": "local/libero_scenes"}, None),
     ],
@@ -99,7 +93,7 @@ def test_what_a_checkpoint_states(
 @pytest.mark.parametrize("convention", ["upright", "libero"])
 def test_the_dataset_on_this_machine_decides(tmp_path: Path, convention: str) -> None:
     """Also under LIBERO's name, and with a policy that reads one camera."""
-    from lerobot_memobench.datasets.lerobot_format.columns import dataset_features
+    from lerobot_memobench.datasets.layout import dataset_features
 
     described = dataset_features((256, 256), CONVENTIONS[convention].values())
     (tmp_path / "libero_scenes" / "meta").mkdir(parents=True)
@@ -150,22 +144,6 @@ def test_the_names_of_a_training_are_those_of_its_evaluation(tmp_path: Path, cap
     assert with_names(mine, MemobenchEnvConfig(convention="libero")) == mine
     assert outcome(path, None) == "libero"
     assert f"pictures have convention=libero, as in the training of {path}" in caplog.text
-
-
-def test_gymnasium(tmp_path: Path) -> None:
-    """A loop of one's own asks for the convention of its checkpoint; LeRobot's `make_policy` compares the names."""
-    for cameras, convention in ((THEIRS, "libero"), (OURS, "upright")):
-        path = saved(tmp_path / convention, cameras)
-        policy = PreTrainedConfig.from_pretrained(path)
-        policy.pretrained_path = path
-        made = chosen_convention(str(path), policy, None)
-        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=made)
-        assert {*env.observation_space["pixels"]} == {*cameras}
-        assert chosen_convention(str(path), policy, env.unwrapped.settings.convention) == convention
-        (other,) = {*CONVENTIONS} - {convention}
-        env = gymnasium.make(f"memobench/{STOVE}-v0", convention=other)
-        with pytest.raises(MemobenchError, match=f"expects pictures of convention={convention}.*, and found {other}"):
-            chosen_convention(str(path), policy, env.unwrapped.settings.convention)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import torch
 from lerobot_memobench.policies.memobench_mem.memory import OURS
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 from lerobot_memobench.policies.memobench_mem.rollout import Rollout
-from tests.policies.test_memory import assert_same, made, present, rolled_out
+from tests.policies.test_memory import assert_same, made, present
 
 ROWS, STRIDE, LENGTH = 3, 4, 12
 
@@ -27,7 +27,7 @@ class Rolled:
 
     def write(self, rows: list[int]) -> None:
         for row in rows:
-            held = self.rollout.rows[row]
+            held = self.rollout.envs[row]
             state = self.mechanism.init(1) if held.memory is None else held.memory
             query = self.query.rows([row])._replace(tokens=None)
             frame = self.frames[row, held.position][None]
@@ -39,7 +39,7 @@ class Rolled:
 
     def read(self, row: int) -> MemoryTokens:
         with torch.no_grad():
-            return self.mechanism.read(self.rollout.rows[row].memory, self.query.rows([row]))
+            return self.mechanism.read(self.rollout.envs[row].memory, self.query.rows([row]))
 
 
 @pytest.fixture(params=OURS)
@@ -62,37 +62,29 @@ def test_a_deleted_memory_begins_with_the_next_frame(rolled: Rolled) -> None:
 
 @torch.no_grad()
 def test_rows_swap_the_memories_that_they_had_before(rolled: Rolled) -> None:
-    before = [rolled.rollout.rows[row].memory for row in range(ROWS)]
-    rolled.rollout.corrupt([0], rolled.rollout.of_next)
-    rolled.rollout.corrupt([1, 2], rolled.rollout.of_next)  # the first row has row 1's memory by now
+    before = [rolled.rollout.envs[row].memory for row in range(ROWS)]
+    rolled.rollout.corrupt([0], rolled.rollout.next_env_memory)
+    rolled.rollout.corrupt([1, 2], rolled.rollout.next_env_memory)  # the first row has row 1's memory by now
     for row in range(ROWS):
-        assert rolled.rollout.rows[row].memory is before[(row + 1) % ROWS]
+        assert rolled.rollout.envs[row].memory is before[(row + 1) % ROWS]
 
 
 @torch.no_grad()
 def test_noise_changes_what_a_row_reads_and_no_other(rolled: Rolled) -> None:
     def noised(row: int) -> Any:
-        return rolled.mechanism.noised(rolled.rollout.rows[row].memory, torch.Generator().manual_seed(5))
+        return rolled.mechanism.noised(rolled.rollout.envs[row].memory, torch.Generator().manual_seed(5))
 
     before = [rolled.read(row) for row in range(ROWS)]
     rolled.rollout.corrupt([1], noised)
     first = rolled.read(1)
     if rolled.mechanism.reads_text:  # the text changes with the next frame at the earliest
-        held = rolled.rollout.rows[1]
+        held = rolled.rollout.envs[1]
         assert not torch.equal(held.memory["frames"], held.intact["frames"])
     else:
         assert float((before[1].rows() - first.rows()).abs().max()) > 1e-3
     assert first.steps is None or torch.equal(first.steps, before[1].steps)
     for row in (0, 2):
         assert_same(rolled.read(row), before[row])
-    rolled.rollout.rows[1].memory = rolled.rollout.rows[1].intact
+    rolled.rollout.envs[1].memory = rolled.rollout.envs[1].intact
     rolled.rollout.corrupt([1], noised)
     assert_same(rolled.read(1), first)
-
-
-def test_a_rollout_writes_as_the_policy_does() -> None:
-    rolled = Rolled("recurrent")
-    with torch.no_grad():
-        rolled.act(range(LENGTH))
-        state = rolled_out(rolled.mechanism, rolled.frames[0, :LENGTH:STRIDE], STRIDE, rolled.query.rows([0]))
-        assert_same(rolled.read(0), rolled.mechanism.read(state, rolled.query.rows([0])))

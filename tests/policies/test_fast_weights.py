@@ -170,13 +170,3 @@ def test_slots_equal_their_formula() -> None:
         expected = torch.stack([mechanism.out.weight @ slot + mechanism.out.bias for slot in slots])
         torch.testing.assert_close(read.each[row], expected, rtol=1e-6, atol=1e-6)  # angles are float32
     assert read.mask.all()
-
-
-@pytest.mark.parametrize("reach", [1, 5])
-def test_gradients_reach_the_last_frames(reach: int) -> None:
-    mechanism = made_recurrent(gradient_frames=reach)
-    frames = torch.randn(9, 3, 32, dtype=torch.float64, requires_grad=True)
-    places = torch.arange(9)[None]
-    mechanism.replay(Histories(frames, torch.arange(9) * 16, places)).each.square().sum().backward()
-    assert frames.grad is not None
-    assert (frames.grad.flatten(1).any(dim=1)).tolist() == [False] * (9 - reach) + [True] * reach

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from benchmarks.random_weights import random_policy
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frame
+from lerobot_memobench.policies.memobench_mem.memory.frames import RememberedFrame
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.policies.memobench_mem.rollout import Row
+from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory
 from tests.support.small_policy import draw_modulation
 
 CAMERA = "observation.images.image"
@@ -61,13 +61,13 @@ def _memory(batch: dict[str, Tensor]) -> Histories:
 def _plan(policy: MemobenchMemPolicy, batch: dict[str, Tensor]) -> Tensor:
     """Return a plan in the middle of an episode with 32 remembered frames."""
     seen = _memory(batch)
-    kept = [Frame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
+    kept = [RememberedFrame(int(step), stored) for step, stored in zip(seen.steps, seen.frames, strict=True)]
     policy.reset()
-    policy.rollout.rows = [Row(clock=(1, kept[-1].step), position=kept[-1].step, memory=[kept])]
+    policy.rollout.envs = [EnvMemory(clock=(1, kept[-1].step), position=kept[-1].step, memory=[kept])]
     keys = (CAMERA, "observation.state", OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
     observation = {key: batch[key] for key in keys} | {"observation.step": torch.tensor([[kept[-1].step + 1.0]])}
     planned = policy.predict_action_chunk(observation)
-    assert len(policy.rollout.rows[0].memory[0]) == FRAMES + 1
+    assert len(policy.rollout.envs[0].memory[0]) == FRAMES + 1
     return planned
 
 

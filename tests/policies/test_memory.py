@@ -16,7 +16,12 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import memory
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frame, Frames, MemoryEncoder, sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.frames import (
+    FrameSampling,
+    MemoryEncoder,
+    RememberedFrame,
+    sample_frames,
+)
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Histories,
     MemoryMechanism,
@@ -24,7 +29,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.motion_fields import MotionField
+from lerobot_memobench.policies.memobench_mem.memory.motion import MotionField
 
 P, D, SUBGOALS = 2, 16, ("close it", "open it", "put it there")
 
@@ -134,7 +139,7 @@ def test_state_is_bounded_and_not_changed_by_later_frames(name: str) -> None:
 def count_numbers(state: Any) -> int:
     if isinstance(state, Tensor):
         return state.numel()
-    if isinstance(state, Frame):
+    if isinstance(state, RememberedFrame):
         return state.stored.numel()
     return sum(map(count_numbers, state.values() if isinstance(state, dict) else state))
 
@@ -176,7 +181,7 @@ def test_packages_that_add_a_broken_memory_are_named(
     ):
         with pytest.raises(MemobenchError, match=f"'{name}'.*{named}"):
             find_mechanism(name)
-    assert find_mechanism.__wrapped__("frames") is Frames
+    assert find_mechanism.__wrapped__("frames") is FrameSampling
     assert "pathlib:Path" in caplog.text
 
 

@@ -20,15 +20,18 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemorySpec,
     NoSettings,
 )
-from lerobot_memobench.policies.memobench_mem.memory.motion import FORESIGHT, FORESIGHT_WEIGHT, HINDSIGHT, Motion
-from lerobot_memobench.policies.memobench_mem.motion_fields import (
+from lerobot_memobench.policies.memobench_mem.memory.motion import (
     BLOCK,
     BLOCKS,
+    FORESIGHT,
+    FORESIGHT_WEIGHT,
+    HINDSIGHT,
     MOVED,
     OFFSETS,
     PER_STEP,
     REACH,
     UNCHANGED,
+    Motion,
     ObjectMotion,
     PictureMotion,
     match_blocks,

@@ -6,16 +6,13 @@ import pytest
 import torch
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PaliGemmaWithExpertModel, PI05Pytorch
-from torch._dynamo.utils import counters
 
-from lerobot_memobench.policies.memobench_mem import layers, network
-from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
+from lerobot_memobench.policies.memobench_mem import fusion
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator, Reading, rotate_from
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryModulator, MemoryPass, rotate_from
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation, adaptive_norms, make_backbone
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
-from lerobot_memobench.policies.memobench_mem.passes import adaptive_norms
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from tests.support.lerobots_passes import lerobots_passes
 from tests.support.memory import histories
@@ -30,7 +27,7 @@ def _config(**fields: object) -> MemobenchMemConfig:
 
 def _inputs(config: MemobenchMemConfig) -> dict[str, object]:
     torch.manual_seed(1)
-    side = config.image_resolution[0]
+    side = config.image_size[0]
     words = 12
     masks = torch.ones(BATCH, words, dtype=torch.bool)
     masks[-1, 7:] = False
@@ -60,7 +57,7 @@ def _seen(inputs: dict) -> Observation:
 
 def _losses(model: MemoryPI05, inputs: dict, memory: MemoryTokens | None = None) -> torch.Tensor:
     drawn = (inputs[key] for key in ("actions", "noise", "time"))
-    return model.forward(_seen(inputs), *drawn, model.reading(memory))
+    return model.forward(_seen(inputs), *drawn, model.memory_pass(memory))
 
 
 def _read(model: MemoryPI05, frames: torch.Tensor, steps: torch.Tensor, mask: torch.Tensor) -> MemoryTokens:
@@ -71,8 +68,8 @@ def _read(model: MemoryPI05, frames: torch.Tensor, steps: torch.Tensor, mask: to
 
 def _actions(model: MemoryPI05, inputs: dict, memory: MemoryTokens | None = None) -> torch.Tensor:
     with torch.no_grad():
-        reading = model.reading(memory)
-    return model.sample_actions(_seen(inputs), inputs["noise"], reading)
+        memory_pass = model.memory_pass(memory)
+    return model.sample_actions(_seen(inputs), inputs["noise"], memory_pass)
 
 
 def _pair(memory_fusion: str = "modulation") -> tuple[MemoryPI05, MemoryPI05]:
@@ -162,47 +159,6 @@ def test_memory_changes_actions_and_padding_does_not(memory_fusion: str) -> None
     assert torch.isfinite(_actions(ours, inputs, memory)).all()
 
 
-@pytest.mark.parametrize("few", [0, 99])
-def test_heads_share_keys(few: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Attention with stored scores and by torch's kernel equals attention per head, with its gradients."""
-    monkeypatch.setattr(layers, "FEW_KEYS", few)
-    torch.manual_seed(0)
-    parts = [torch.randn(shape, requires_grad=True) for shape in ((2, 5, 8, 4), (2, 7, 4), (2, 7, 4))]
-    for seen in (torch.arange(7) < torch.tensor([[[7]], [[2]]]), torch.rand(2, 5, 7) < 0.6):
-        bias = layers.hidden(seen)
-        query, key, value = parts
-        scores = torch.einsum("bnhd,bmd->bhnm", query, key) / 2 + bias.unsqueeze(1)
-        alone = torch.einsum("bhnm,bmd->bnhd", scores.softmax(dim=-1), value).flatten(2)
-        found = layers.attend(query, key, value, bias)
-        torch.testing.assert_close(found, alone)
-        along = torch.randn_like(found)
-        expected = torch.autograd.grad(alone, parts, along)
-        for ours, of_each in zip(torch.autograd.grad(found, parts, along), expected, strict=True):
-            torch.testing.assert_close(ours, of_each)
-
-
-@pytest.mark.slow
-def test_passes_compile_without_graph_breaks(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda part, mode, **how: original(part, backend="aot_eager", **how))
-    network.compiled.cache_clear()
-    found = []
-    for compiles in (False, True):
-        torch.manual_seed(0)
-        ours = MemoryPI05(_config(compile_model=compiles))
-        draw_modulation(ours)
-        inputs = _inputs(ours.config)
-        with torch.no_grad():
-            memory = _read(ours, *_memory(ours.config))
-            actions = [_actions(ours, inputs, memory) for _ in range(2)]
-        _losses(ours, inputs, _read(ours, *_memory(ours.config))).mean().backward()
-        found.append([*actions, *(one.grad for one in ours.parameters() if one.grad is not None)])
-    network.compiled.cache_clear()
-    assert counters["stats"]["unique_graphs"] > 0
-    for plain, captured in zip(*found, strict=True):
-        torch.testing.assert_close(plain, captured, rtol=1e-4, atol=1e-6)
-
-
 def test_instruction_conditions_norms_without_its_padding() -> None:
     config = _config(size="small", perception="objects")
     torch.manual_seed(0)
@@ -214,9 +170,9 @@ def test_instruction_conditions_norms_without_its_padding() -> None:
     shown = [torch.zeros(2, SLOTS, dtype=torch.bool), torch.ones(2, dtype=torch.bool)]
 
     def condition(words: torch.Tensor) -> torch.Tensor:
-        reading = Reading()
-        prefix = model.embed(Observation(seen, shown, words, short), reading)
-        (modulation, *_) = model.modulations(torch.ones(2), prefix.instruction, reading)
+        plain = MemoryPass()
+        prefix = model.embed(Observation(seen, shown, words, short), plain)
+        (modulation, *_) = model.modulations(torch.ones(2), prefix.instruction, plain)
         return modulation.flatten(1)
 
     found = condition(tokens)
@@ -270,7 +226,7 @@ def _modulator() -> MemoryModulator:
 
 
 def _modulated(modulator: MemoryModulator, actions: torch.Tensor, memory: MemoryTokens) -> tuple[torch.Tensor, ...]:
-    return modulator(layers.rms_norm(actions), memory, modulator.keys(memory))
+    return modulator(fusion.rms_norm(actions), memory, modulator.keys(memory))
 
 
 def test_shared_frames_equal_copies() -> None:

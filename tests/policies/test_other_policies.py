@@ -13,22 +13,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from safetensors import safe_open
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.streams import write_streams
+from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.envs.evaluation_file import protocol_of
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
 from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.lerobots_trainer import trainer_in_this_process
+from tests.support.logs import protocol_of
 from tests.support.tiny_paligemma import shrink_paligemma
 from tests.support.tiny_smolvlm import tiny_smolvlm
 
 TASK = "turn_on_the_stove_and_turn_it_off"
-STATE, OBJECTS, PRIVILEGED = "observation.state", "observation.environment_state", "privileged.environment_state"
+STATE, OBJECTS = "observation.state", "observation.environment_state"
 PICTURES = {"observation.images.image", "observation.images.wrist_image"}
 INPUTS = {*PICTURES, STATE}
 
@@ -50,36 +49,14 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     # Phase, checkpoints, subgoals and language are inputs of memory policies alone.
     assert set(config["input_features"]) == inputs
     assert set(config["output_features"]) == {"action"}
-    assert normalised(checkpoint, inputs) <= {*inputs, "action"} | KEPT
+    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
+    (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
+    assert set(step["config"]["features"]) == {*inputs, "action"}
     words = (f"tasks={TASK}", "episodes=1", "horizon=3", f"output_dir={out / 'eval'}")
     assert main(["eval", "env=memobench", f"policy={run}", *words]) == 0
     (record,) = read_episodes(out / "eval")
     assert record["steps"] == 3
     return protocol_of(out / "eval")
-
-
-#: LeRobot saves the statistics of every column; the features of its step list the ones in use.
-KEPT = {
-    *PICTURES,
-    OBJECTS,
-    PRIVILEGED,
-    "executed_action",
-    "held",
-    "checkpoint.index",
-    "checkpoint.operation",
-    "checkpoint.completed",
-    "checkpoint.event",
-    *("timestamp", "frame_index", "episode_index", "index", "task_index"),
-}
-
-
-def normalised(checkpoint: Path, inputs: set[str]) -> set[str]:
-    """Return the columns whose statistics a checkpoint's preprocessor holds; check the ones in use."""
-    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
-    (step,) = [step for step in steps if step.get("registry_name") == "normalizer_processor"]
-    assert set(step["config"]["features"]) == {*inputs, "action"}
-    with safe_open(checkpoint / step["state_file"], framework="numpy") as file:
-        return {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118
 
 
 ACT = (
@@ -94,19 +71,23 @@ DIFFUSION = (
 )
 
 
-@pytest.mark.parametrize("policy", [pytest.param(ACT, marks=pytest.mark.slow), DIFFUSION], ids=["act", "diffusion"])
-def test_policies_on_pictures(policy: tuple[str, ...], dataset: Path, tmp_path: Path) -> None:
-    assert train_and_roll_out(dataset, tmp_path, *policy)["obs_type"] == "pixels_agent_pos"
+SHOWN = {
+    "pixels": (True, None, "pixels_agent_pos"),
+    "both": (True, "both", "both"),
+    "objects alone": (False, None, "environment_state_agent_pos"),
+    "objects": (True, "environment_state_agent_pos", "environment_state_agent_pos"),
+}
+DEFAULT = (("diffusion", "pixels"), ("act", "both"))
 
 
-@pytest.mark.parametrize("policy", [ACT, pytest.param(DIFFUSION, marks=pytest.mark.slow)], ids=["act", "diffusion"])
 @pytest.mark.parametrize(
-    ("pictures", "obs_type", "seen"),
+    ("policy", "pictures", "obs_type", "seen"),
     [
-        (True, "both", "both"),
-        pytest.param(False, None, "environment_state_agent_pos", marks=pytest.mark.slow),
-        pytest.param(True, None, "pixels_agent_pos", marks=pytest.mark.slow),
-        pytest.param(True, "environment_state_agent_pos", "environment_state_agent_pos", marks=pytest.mark.slow),
+        pytest.param(
+            words, *SHOWN[case], marks=() if (name, case) in DEFAULT else pytest.mark.slow, id=f"{name} {case}"
+        )
+        for name, words in (("act", ACT), ("diffusion", DIFFUSION))
+        for case in SHOWN
     ],
 )
 def test_evaluation_has_the_inputs_of_training(
@@ -222,7 +203,7 @@ def test_first_plan_reads_the_first_execution_frame(
 
 
 def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
-    from lerobot_memobench.policies.baselines.modeling_baselines import MemobenchExpertPolicy
+    from lerobot_memobench.policies.baselines import MemobenchExpertPolicy
 
     settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
     clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)

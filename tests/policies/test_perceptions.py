@@ -22,28 +22,24 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.datasets.episodes import list_episodes
+from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import save_detector
-from lerobot_memobench.policies.memobench_mem import objects
-from lerobot_memobench.policies.memobench_mem.detection_noise import (
-    FALSE,
-    KIND_MISSED,
-    MISSED,
-    with_detection_noise,
-)
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
-from lerobot_memobench.policies.memobench_mem.fusion import Reading
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, PLACES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import (
     DETECTED,
+    FALSE,
     FEATURES,
+    KIND_MISSED,
+    MISSED,
     OBS_RAW_STATE,
     VIEWS,
     ObjectEncoder,
@@ -51,6 +47,7 @@ from lerobot_memobench.policies.memobench_mem.objects import (
     SlotEncoder,
     frame_row,
     slot_features,
+    with_detection_noise,
 )
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, field
 from lerobot_memobench.sim.object_layout import WIDTH as SLOT_WIDTH
@@ -191,7 +188,7 @@ def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
     assert difference(frames[0], frames[7]) > 4 * case.of.rounding, "frames differ"
     prefixes = []
     for batch in (trained, acted):
-        prefix = policy.model.embed(policy._seen(batch | {key: trained[key] for key in PROMPT_KEYS}), Reading())
+        prefix = policy.model.embed(policy._observed(batch | {key: trained[key] for key in PROMPT_KEYS}), MemoryPass())
         prefixes.append(prefix.tokens[prefix.real])
     assert difference(*prefixes) <= 2 * case.of.rounding
 
@@ -519,21 +516,3 @@ def test_errors_are_drawn_once_per_frame() -> None:
     assert not torch.equal(first[FRAMES], second[FRAMES])
     without = {name: one for name, one in batch.items() if name != FRAMES}
     assert perception.observed(without).keys() == without.keys()
-
-
-@pytest.mark.parametrize("memory", ["bank", pytest.param("motion", marks=pytest.mark.slow)])
-def test_frames_share_their_errors(root: Path, monkeypatch: pytest.MonkeyPatch, memory: str) -> None:
-    drawn: list[int] = []
-
-    def counted(slots: torch.Tensor, hand: torch.Tensor, size: float) -> torch.Tensor:
-        drawn.append(len(slots))
-        return with_detection_noise(slots, hand, size)
-
-    monkeypatch.setattr(objects, "with_detection_noise", counted)
-    settings = {"size": "small", "perception": "objects", "memory_stride": 8}
-    policy, before, _, dataset = made_for_training(root, memory=memory, detection_noise=1.0, **settings)
-    batch = before(batch_of(dataset, [16] * 16))
-    policy.train().forward(batch)
-    assert drawn == [len(batch[FRAMES])]
-    policy.eval().forward(batch)
-    assert len(drawn) == 1

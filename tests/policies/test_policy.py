@@ -1,9 +1,8 @@
-"""The policy: training batches, rollouts of independent rows, real-time chunking, precision, checkpoints."""
+"""The policy: training batches, rollouts of independent rows, precision, checkpoints."""
 
 from __future__ import annotations
 
 import copy
-import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
-from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -23,11 +21,10 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
-    GatherMemoryProcessorStep,
     WordTokenizerProcessorStep,
 )
-from lerobot_memobench.policies.memobench_mem.rollout import Rollout, Row
-from lerobot_memobench.protocol import CONTROL_HZ, ENDED, EXECUTION, NO_CLOCK, PROMPT
+from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory, Rollout
+from lerobot_memobench.protocol import ENDED, EXECUTION, NO_CLOCK, PROMPT
 from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.data import Training
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
@@ -168,7 +165,7 @@ def moved(index: int, by: float) -> Tensor:
 )
 def test_stalled_hands_are_recognised(state: Tensor | None, first: int) -> None:
     """One state has nearly the same rotation with the opposite axis; an equal one is of a held hand."""
-    row, chunk = Row(), torch.arange(16.0)[:, None]
+    row, chunk = EnvMemory(), torch.arange(16.0)[:, None]
 
     def begins(state: Tensor | None) -> int:
         row.queue.clear()
@@ -198,7 +195,7 @@ def test_one_thread_runs_a_rollout(trained: Any) -> None:
             act()
     policy.reset()
     act()
-    (row,) = policy.rollout.rows
+    (row,) = policy.rollout.envs
     history = row.memory
     policy.drop_queued_actions()
     assert not row.queue
@@ -227,18 +224,15 @@ def test_rows_follow_their_clock(
 ) -> None:
     written: list[int] = []
     rollout = Rollout(remembers=True, stride=1)
-    found = [rollout.observe([clock], lambda rows, k=k: written.append(k)) for k, clock in enumerate(clocks)]  # type: ignore[misc]
-    assert [steps[0] for steps, _, _ in found] == positions
-    assert [k for k, (_, started, _) in enumerate(found) if started[0]] == begins
-    assert [k for k, (_, _, is_frozen) in enumerate(found) if is_frozen[0]] == frozen
+    found = []
+    for k, clock in enumerate(clocks):
+        (started,) = rollout.observe([clock], lambda rows, k=k: written.append(k))  # type: ignore[misc]
+        (env,) = rollout.envs
+        found.append((env.position, started, env.frozen))
+    assert [position for position, _, _ in found] == positions
+    assert [k for k, (_, started, _) in enumerate(found) if started] == begins
+    assert [k for k, (_, _, is_frozen) in enumerate(found) if is_frozen] == frozen
     assert written == [k for k in range(len(clocks)) if k not in frozen]
-
-
-def test_frozen_rows_are_not_written() -> None:
-    rollout, written = Rollout(remembers=True, stride=1), list[list[int]]()
-    for clocks in ([(1, 0), (1, 0)], [(1, 1), (1, 0)], [(1, 1), (1, 0)]):
-        rollout.observe(clocks, written.append)
-    assert written == [[0, 1], [0]]
 
 
 def test_unobserved_frames_are_noticed() -> None:
@@ -256,13 +250,13 @@ def test_unobserved_frames_are_noticed() -> None:
 def test_repeated_frames_are_left_out_as_in_training(tmp_path: Path) -> None:
     """Holds at frames 4, 14 and 22 repeat the frame at which they begin."""
     root = make_held_dataset(tmp_path / "data")
-    fields = OBJECTS | {"memory_settings": {"frames": 4}, "memory_repeats": False}
+    fields = OBJECTS | {"memory_settings": {"frames": 4}}
     policy, before, _, dataset = made_for_training(root, **fields)
     last = HELD_LENGTHS[0] - 1
     policy.reset()
     for step in range(last + 1):
         policy.observe(before(observed(dataset, step)))
-    stored = [frame.step for frame in policy.rollout.rows[0].memory[0]]
+    stored = [frame.step for frame in policy.rollout.envs[0].memory[0]]
     assert stored == [0, 2, 4, 10, 12, 14, 18, 20, 22]
     (rolled,), (trained,) = remembered(policy, [0]), trained_on(before(batch_of(dataset, [last])))
     assert rolled[1] == trained[1] == [0, 4, 14, 22]
@@ -270,49 +264,6 @@ def test_repeated_frames_are_left_out_as_in_training(tmp_path: Path) -> None:
 
 
 # -- chunks for LeRobot --------------------------------------------------------------------------------------------
-
-
-def real_time(policy: Any) -> Any:
-    """Enable real-time chunking as lerobot/rollout/context.py does."""
-    policy.config.rtc_config = RTCConfig(enabled=True, execution_horizon=3)
-    policy.init_rtc_processor()
-    policy.reset()
-    return policy
-
-
-def test_real_time_chunking_guides_plans_with_memory(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a clock each observation is remembered at its time."""
-    fields = OBJECTS | {"objective": "flow_matching", "num_inference_steps": 10}
-    policy, before, _, dataset = made_for_training(root, **fields)
-    draw_modulation(policy)
-    assert real_time(policy).supports_rtc()
-    noise = torch.randn(1, policy.config.chunk_size, 32, generator=torch.Generator().manual_seed(0))
-
-    def plans(first: int) -> list[Tensor]:
-        """Return the free and the guided plan at step 7, after a plan at step 0 that saw another frame."""
-        found = []
-        for left_over in (None, torch.full((3, 7), 0.5)):
-            policy.reset()
-            for step, index in ((0, first), (7, STARTS[2] + 7)):
-                monkeypatch.setattr("time.monotonic", lambda step=step: 100.0 + step / CONTROL_HZ)
-                batch = before(observed(dataset, index, clock=False))
-                guidance = {} if step == 0 else {"inference_delay": 3, "prev_chunk_left_over": left_over}
-                plan = policy.predict_action_chunk(batch, noise=noise, **guidance)
-            found.append(plan)
-        return found
-
-    free, guided = plans(STARTS[2])
-    assert [step for _, steps in remembered(policy, [0]) for step in steps] == [0, 7]
-    apart = [float((plan[0, :3] - 0.5).abs().mean()) for plan in (free, guided)]
-    assert apart[1] < 0.1 < apart[0]
-    assert not torch.equal(guided, plans(20)[1])
-
-
-def test_regression_has_no_real_time_chunking(root: Path) -> None:
-    policy, before, _, dataset = made_for_training(root, **OBJECTS, memory="none")
-    assert not policy.supports_rtc()
-    with pytest.raises(MemobenchError, match=r"inference\.type=sync.*flow_matching"):
-        real_time(policy).predict_action_chunk(before(observed(dataset, 10)), inference_delay=3)
 
 
 def test_plans_need_every_observation(root: Path) -> None:
@@ -330,22 +281,20 @@ def test_plans_need_every_observation(root: Path) -> None:
 @pytest.mark.parametrize("clock", [True, False])
 def test_observe_and_plan_equal_select_action(root: Path, clock: bool) -> None:
     policy, before, _, dataset = made_for_training(root, **OBJECTS)
+    batches = [before(observed(dataset, STARTS[2] + step, clock=clock)) for step in range(13)]
     policy.reset()
     plans, actions = [], []
-    for step in range(13):
-        batch = before(observed(dataset, STARTS[2] + step, clock=clock))
+    for batch in batches:
         policy.observe(batch)
-        if step % 6 == 0:
-            plans.append(policy.predict_action_chunk(batch))
+        plans.append(policy.predict_action_chunk(batch) if len(plans) % 6 == 0 else None)
     trained = before(batch_of(dataset, [STARTS[2] + 12]))
     assert remembered(policy, [0])[0][1] == trained_on(trained)[0][1]
     policy.reset()
-    for step in range(13):
+    for batch in batches:
         policy.drop_queued_actions()
-        action = policy.select_action(before(observed(dataset, STARTS[2] + step, clock=clock)))
-        if step % 6 == 0:
-            actions.append(action)
-    assert all(torch.allclose(plan[:, 0], action, atol=1e-5) for plan, action in zip(plans, actions, strict=True))
+        actions.append(policy.select_action(batch))
+    for plan, action in zip(plans, actions, strict=True):
+        assert plan is None or torch.allclose(plan[:, 0], action, atol=1e-5)
 
 
 # -- checkpoints ---------------------------------------------------------------------------------------------------
@@ -358,19 +307,11 @@ def copied(folder: Path, target: Path) -> Path:
 
 def test_a_training_from_a_checkpoint_keeps_its_processors(trained: Any, root: Path) -> None:
     policy, before, dataset, folder, _ = trained
-    config: Any = PreTrainedConfig.from_pretrained(folder)
-    config.pretrained_path = folder
     acting = MemobenchMemPolicy.from_pretrained(folder)
     assert all(torch.equal(one, policy.state_dict()[name]) for name, one in acting.state_dict().items())
-    training = open_small_training(root, config)
-    for pipeline, lookup in (
-        (training.processors[0], training.lookup),
-        (make_pre_post_processors(config, pretrained_path=str(folder))[0], None),
-    ):
-        step = next(step for step in pipeline.steps if isinstance(step, GatherMemoryProcessorStep))
-        assert step.lookup is lookup
+    again = training_from(root, folder).processors[0]
     raw = batch_of(dataset, [10, 50])
-    first, second = before(copy.deepcopy(raw)), training.processors[0](copy.deepcopy(raw))
+    first, second = before(copy.deepcopy(raw)), again(copy.deepcopy(raw))
     for key in (FRAMES, "memory.text", "observation.language.tokens", "action"):
         assert torch.equal(first[key], second[key]), key
 
@@ -455,28 +396,9 @@ def _tokenizer(checkpoint: Path) -> WordTokenizerProcessorStep:
     return next(step for step in pipeline.steps if isinstance(step, WordTokenizerProcessorStep))
 
 
-def _edited(start: Path, target: Path, **changed: dict[str, Any] | None) -> Path:
-    """Copy a checkpoint with other settings of preprocessor steps, or without them (None)."""
-    shutil.copytree(start, target)
-    path = target / "policy_preprocessor.json"
-    saved = json.loads(path.read_text())
-    saved["steps"] = [step for step in saved["steps"] if changed.get(step["registry_name"], step) is not None]
-    for step in saved["steps"]:
-        step["config"] |= changed.get(step["registry_name"]) or {}
-    path.write_text(json.dumps(saved))
-    return target
-
-
-def test_settings_that_saved_processors_lack_are_refused(dataset_root: Path, start: Path, tmp_path: Path) -> None:
-    old = _edited(start, tmp_path / "old", memobench_oracle_memory=None)  # as checkpoints were before
-    relative = _edited(start, tmp_path / "relative", relative_actions_processor={"enabled": True})
-    for checkpoint, settings, named in (
-        (old, {"oracle_memory": True}, "oracle_memory"),
-        (relative, {}, "use_relative_actions"),
-        (start, {"tokenizer_name": "google/some"}, "tokenizer_name"),
-    ):
-        with pytest.raises(MemobenchError, match=named):
-            training_from(dataset_root, checkpoint, **settings)
+def test_settings_that_saved_processors_lack_are_refused(dataset_root: Path, start: Path) -> None:
+    with pytest.raises(MemobenchError, match="tokenizer_name"):
+        training_from(dataset_root, start, tokenizer_name="google/some")
     config: Any = PreTrainedConfig.from_pretrained(start)
     config.oracle_memory = True
     with pytest.raises(MemobenchError, match="oracle_memory"):

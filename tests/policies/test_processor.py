@@ -17,7 +17,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     make_vocabulary,
     make_word_tokenizer,
 )
-from lerobot_memobench.policies.memobench_mem.text_encoders import WordTextEncoder, make_text_encoder, words
+from lerobot_memobench.policies.memobench_mem.texts import WordTextEncoder, make_text_encoder, words
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from tests.support.small_policy import batch_of, made_for_training, small_config

@@ -9,10 +9,10 @@ from torch import Tensor
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.fusion import Prefix
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Query
-from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, CheckpointTexts, NarrowReading, scored
+from lerobot_memobench.policies.memobench_mem.memory.subgoal import SCORES, CheckpointTexts, NarrowPass, scored
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM
-from lerobot_memobench.policies.memobench_mem.subgoals import choices
+from lerobot_memobench.policies.memobench_mem.texts import choices
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS
 from lerobot_memobench.tasks.memory_text import with_memory
 from tests.support.memory import histories
@@ -50,7 +50,7 @@ def inputs_of(model: MemoryPI05, seed: int = 1) -> Observation:
     real = torch.ones(B, 7, dtype=torch.bool)
     real[1, 4:] = False
     if model.state_token is None:
-        side = model.config.image_resolution[0]
+        side = model.config.image_size[0]
         seen = [torch.rand(B, 3, side, side, generator=chance) * 2 - 1]
         shown = [torch.ones(B, dtype=torch.bool)]
     else:
@@ -65,7 +65,7 @@ def remember(
     seed: int = 2,
     subgoal: list[int] | None = None,
     learns: bool = False,
-) -> NarrowReading:
+) -> NarrowPass:
     """Begin a pass over a history of three frames, with or without true texts."""
     memory, chance = model.memory, torch.Generator().manual_seed(seed)
     assert memory is not None
@@ -75,31 +75,31 @@ def remember(
     query = Query(choices=choices, subgoal=None if subgoal is None else torch.tensor(subgoal))
     read = memory.replay(histories(frames, torch.arange(3).repeat(B, 1), torch.ones(B, 3, dtype=torch.bool)), query)
     each = read.each.detach().requires_grad_(learns)
-    reading = model.reading(read._replace(each=each))
-    assert isinstance(reading, NarrowReading)
-    return reading
+    memory_pass = model.memory_pass(read._replace(each=each))
+    assert isinstance(memory_pass, NarrowPass)
+    return memory_pass
 
 
-def passed(model: MemoryPI05, seen: Observation, actions: Tensor, reading: NarrowReading) -> Tensor:
+def passed(model: MemoryPI05, seen: Observation, actions: Tensor, memory_pass: NarrowPass) -> Tensor:
     """Return the losses of a training's pass at time 1, from zero noise to these actions."""
-    return model.forward(seen, actions, torch.zeros_like(actions), torch.ones(B), reading)
+    return model.forward(seen, actions, torch.zeros_like(actions), torch.ones(B), memory_pass)
 
 
-def planned(model: MemoryPI05, seen: Observation, reading: NarrowReading) -> Tensor:
+def planned(model: MemoryPI05, seen: Observation, memory_pass: NarrowPass) -> Tensor:
     """Return the chunk of one step of denoising from zero noise."""
-    return model.sample_actions(seen, torch.zeros(B, CHUNK, model.config.max_action_dim), reading)
+    return model.sample_actions(seen, torch.zeros(B, CHUNK, model.config.max_action_dim), memory_pass)
 
 
 def attend_to_text_alone(patch: pytest.MonkeyPatch) -> None:
     """Let the text attend only to itself, so that its states do not depend on the prefix."""
-    attends = NarrowReading.attends
+    attends = NarrowPass.attends
 
-    def narrowed(reading: NarrowReading, prefix: Prefix, unread: int, copies: int) -> Tensor:
-        seen = attends(reading, prefix, unread, copies).clone()
+    def narrowed(memory_pass: NarrowPass, prefix: Prefix, unread: int, copies: int) -> Tensor:
+        seen = attends(memory_pass, prefix, unread, copies).clone()
         seen[:, unread:, :unread] = False
         return seen
 
-    patch.setattr(NarrowReading, "attends", narrowed)
+    patch.setattr(NarrowPass, "attends", narrowed)
 
 
 def test_actions_read_only_the_text(model: MemoryPI05) -> None:
@@ -128,9 +128,9 @@ def test_gradients_flow_only_through_the_text(model: MemoryPI05) -> None:
     model.train()
     actions = torch.randn(B, CHUNK, model.config.max_action_dim)
 
-    def learned() -> tuple[NarrowReading, Tensor, Tensor]:
-        reading = remember(model, subgoal=[0, -1], learns=True)
-        return reading, reading.memory.each, passed(model, inputs_of(model), actions, reading)
+    def learned() -> tuple[NarrowPass, Tensor, Tensor]:
+        memory_pass = remember(model, subgoal=[0, -1], learns=True)
+        return memory_pass, memory_pass.memory.each, passed(model, inputs_of(model), actions, memory_pass)
 
     _, history, losses = learned()
     losses.mean().backward()
@@ -141,9 +141,9 @@ def test_gradients_flow_only_through_the_text(model: MemoryPI05) -> None:
         _, history, losses = learned()
         losses.mean().backward()
     assert history.grad is None or not history.grad.any()
-    reading, history, _ = learned()
+    memory_pass, history, _ = learned()
     assert model.memory is not None
-    loss = model.memory.losses(reading.outputs | {SUBGOAL: torch.tensor([0, -1])})["subgoal"]
+    loss = model.memory.losses(memory_pass.outputs | {SUBGOAL: torch.tensor([0, -1])})["subgoal"]
     assert loss[1] == 0
     loss.sum().backward()
     assert history.grad is not None
@@ -152,29 +152,29 @@ def test_gradients_flow_only_through_the_text(model: MemoryPI05) -> None:
 
 def test_acting_equals_training(model: MemoryPI05) -> None:
     """One step of denoising ends at actions for which a training pass with the same text has no error."""
-    reading = remember(model)
-    actions = planned(model, inputs_of(model), reading)
-    assert reading.chosen is not None
-    true = remember(model, subgoal=reading.chosen.tolist())
+    memory_pass = remember(model)
+    actions = planned(model, inputs_of(model), memory_pass)
+    assert memory_pass.chosen is not None
+    true = remember(model, subgoal=memory_pass.chosen.tolist())
     assert passed(model, inputs_of(model), actions, true).max() < 1e-8
 
 
 def test_choice_is_independent_of_the_true_text(model: MemoryPI05) -> None:
     inputs, scores = inputs_of(model), []
     for subgoal in ([0, 2], [1, 1], [-1, -1]):
-        reading = remember(model, subgoal=subgoal)
+        memory_pass = remember(model, subgoal=subgoal)
         with torch.no_grad():
-            passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim), reading)
-        assert reading.chosen is not None
-        assert reading.chosen.tolist() == [TEXTS if text < 0 else text for text in subgoal]
-        scores.append(reading.outputs[SCORES])
-    reading = remember(model)
-    planned(model, inputs, reading)
-    assert reading.chosen is not None
+            passed(model, inputs, torch.zeros(B, CHUNK, model.config.max_action_dim), memory_pass)
+        assert memory_pass.chosen is not None
+        assert memory_pass.chosen.tolist() == [TEXTS if text < 0 else text for text in subgoal]
+        scores.append(memory_pass.outputs[SCORES])
+    memory_pass = remember(model)
+    planned(model, inputs, memory_pass)
+    assert memory_pass.chosen is not None
     for other in scores:
-        torch.testing.assert_close(other, reading.outputs[SCORES])
-    first, second = reading.outputs[SCORES].argmax(dim=1).tolist()
-    assert reading.chosen.tolist() == [first, second]
+        torch.testing.assert_close(other, memory_pass.outputs[SCORES])
+    first, second = memory_pass.outputs[SCORES].argmax(dim=1).tolist()
+    assert memory_pass.chosen.tolist() == [first, second]
     assert first in (0, 1)
     assert second in (1, 2)
 

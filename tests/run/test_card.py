@@ -6,34 +6,20 @@ import hashlib
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.envs.episode import referent_of
-from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import disagreement, outcome
+from lerobot_memobench.evaluation.records import disagreement
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
-from lerobot_memobench.run.card import (
-    extended,
-    first_variant_mismatch,
-    joined_runs,
-    new_card,
-    policy_facts,
-    run_facts,
-    training_facts,
-    with_checkpoint,
-    with_episodes,
-    write_card,
-)
-from lerobot_memobench.run.rerun import check_version
+from lerobot_memobench.run.card import extended, joined_runs, policy_facts, run_facts, training_facts, with_checkpoint
 from lerobot_memobench.run.run import resumed_card
 from lerobot_memobench.run.shards import merge
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
-from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import logs
 
 
@@ -44,42 +30,25 @@ def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, 
 
 def card(**changes: Any) -> dict[str, Any]:
     parts: dict[str, Any] = {
-        "protocol": {
-            "tasks": ["a"],
-            "episodes": 2,
-            "seed_base": 7,
-            "referent": "fixed",
-            "horizon": 1200,
-            WORLD: LIBERO,
-        },
+        "protocol": {"tasks": ["a"], "episodes": 2, "seed_base": 7, "referent": "fixed", "horizon": 1200},
         "policy": policy_facts({"type": "act", "chunk_size": 50, "device": "cuda"}, 7),
-        "checkpoint": None,
-        "trained_on": None,
         "task_files": {"a": "1"},
-        "settings": {"env": {"tasks": "a"}, "policy": {"type": "act"}, "episodes": 2},
-        "runs": [run_facts(["lerobot", "eval"], 2)],
+        "settings": {"env": {"tasks": "a"}, "policy": {"type": "act"}},
     }
-    return new_card(**{**parts, **changes})
+    return logs.card(**parts | changes)
 
 
 def test_a_card_is_read_back_as_it_was_written(tmp_path: Path) -> None:
-    full = with_episodes(card(), [record("a", k) for k in range(3)])
-    write_card(tmp_path, full)
-    assert read_evaluation(tmp_path, whole=True) == json.loads(json.dumps(full))
-    text = (tmp_path / "evaluation.json").read_text()
-    assert sum('"scene_hash"' in line for line in text.splitlines()) == 3  # one episode a line
-    assert full["episodes"][0] == {k: v for k, v in record("a").items() if k not in ("wall_s", "replan_steps", WORLD)}
-    kept = with_episodes(full, [record("a", 0, success=False), record("a", 3)])["episodes"]
-    assert [(each["episode"], each["success"]) for each in kept] == [(k, True) for k in range(4)]
-    write_card(tmp_path, card())
-    assert read_evaluation(tmp_path)["episodes"] == []
+    write_evaluation(tmp_path, card())
+    assert read_evaluation(tmp_path, whole=True) == json.loads(json.dumps(card()))
 
 
 @pytest.mark.parametrize("missing", ["tasks", "episodes"])
 def test_a_card_without_its_extent_is_refused(tmp_path: Path, missing: str) -> None:
-    EpisodeLog(tmp_path).append(record("a"))
+    EpisodeLog(tmp_path).append(line_of(record("a")))
     now = card()
-    write_card(tmp_path, {**now, "protocol": {key: now["protocol"][key] for key in now["protocol"] if key != missing}})
+    protocol = {key: now["protocol"][key] for key in now["protocol"] if key != missing}
+    write_evaluation(tmp_path, {**now, "protocol": protocol})
     for use in (lambda: resumed_card(tmp_path, now, print), lambda: merge(tmp_path / "out", [tmp_path])):
         with pytest.raises(MemobenchError, match=f"{missing} in protocol"):
             use()
@@ -105,15 +74,19 @@ def test_a_policy_is_known_by_settings_checkpoint_and_detector(tmp_path: Path, m
     cached = lambda repo, name: str(snapshot / name) if (snapshot / name).exists() else None  # noqa: E731
     monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", cached)
     plain: dict[str, Any] = {"policy": {"type": "act"}, "checkpoint": None, "trained_on": None}
-    assert with_checkpoint(plain, None) == with_checkpoint(plain, "user/name") == plain
+    monkeypatch.setattr("lerobot_memobench.run.card.identity_of", lambda policy, path, weights: f"act {weights}")
+    of_path: Any = lambda path: SimpleNamespace(policy=None, policy_path=path)  # noqa: E731
+    assert with_checkpoint(plain, of_path(None)) == {**plain, "policy": {"type": "act", "identity": "act None"}}
+    assert with_checkpoint(plain, of_path("user/name")) == plain
     (snapshot / "config.json").write_text("{}")
-    assert with_checkpoint(plain, "user/name") == plain
+    assert with_checkpoint(plain, of_path("user/name")) == plain
     (snapshot / "model.safetensors").write_bytes(b"weights")
     (snapshot / "train_config.json").write_text("{}")  # not part of the policy
-    found = with_checkpoint(plain, "user/name")
+    found = with_checkpoint(plain, of_path("user/name"))
     assert sorted(found["checkpoint"]["files"]) == ["config.json", "model.safetensors"]
     assert found["checkpoint"]["revision"] == snapshot.name
     sums = subprocess.run(["sha256sum", "config.json", "model.safetensors"], cwd=snapshot, capture_output=True)
+    assert found["policy"]["identity"] == f"act {found['policy']['sha256']}"
     assert found["policy"]["sha256"] == hashlib.sha256(sums.stdout).hexdigest() == tree_hash(checkpoint_files(snapshot))
 
 
@@ -158,18 +131,14 @@ def test_equal_runs_are_counted() -> None:
     assert joined_runs([{**a, "times": 3}, a], again=False) == [{**a, "times": 3}]
 
 
-@pytest.mark.parametrize("earlier", [False, True], ids=["this version", "a card with flags"])
-def test_a_card_is_widened(earlier: bool) -> None:
+def test_a_card_is_widened() -> None:
     old = card(shard="1/2")
-    if earlier:
-        del old["settings"]
-        old |= {"format": 1, "flags": ["--env.type=memobench"]}
     wide = card(protocol={"tasks": ["b"], "episodes": 5, "seed_base": 7}, task_files={"b": "2"}, shard="2/2")
     both = extended(old, wide)
-    assert (both["format"], both["protocol"]["tasks"], both["protocol"]["episodes"]) == (2, ["a", "b"], 5)
+    assert (both["protocol"]["tasks"], both["protocol"]["episodes"]) == (["a", "b"], 5)
     assert (both["protocol"]["horizon"], both["task_files"]) == (1200, {"a": "1", "b": "2"})
-    assert both["settings"] == {"env": {"tasks": "a,b"}, "policy": {"type": "act"}, "episodes": 5}
-    assert (both["runs"][0]["times"], both["shard"], "flags" in both) == (2, None, False)
+    assert both["settings"] == {"env": {"tasks": "a,b"}, "policy": {"type": "act"}}
+    assert (both["runs"][0]["times"], both["shard"]) == (2, None)
     assert extended(old, old)["shard"] == "1/2"
 
 
@@ -188,33 +157,8 @@ def test_a_card_is_widened(earlier: bool) -> None:
     ],
 )
 def test_the_first_disagreement_is_named(changes: dict[str, Any], named: str) -> None:
-    assert disagreement(record(), record(wall_s=9.0)) is disagreement(outcome(record()), record()) is None
+    assert disagreement(record(), record(wall_s=9.0), "here", "there") is None
     found = disagreement(record(), record(**changes), "on the card", "here")
     assert found is not None
     assert found.startswith("a_task, episode 0: ")
     assert named in found
-
-
-def test_episodes_of_another_rule_of_drawing_are_refused(tmp_path: Path) -> None:
-    bowl = "put_the_butter_into_the_bowl_from_the_prompt_video"
-    here = {seed: referent_of(get_task(bowl), seed).variant_index for seed in (7, 8)}
-    lines = [record(bowl, seed - 7, seed=seed, referent="random", variant=k) for seed, k in here.items()]
-    assert first_variant_mismatch(lines) is None
-    assert first_variant_mismatch([record("of_my_own", variant=5, referent="random", seed=7)]) is None
-    assert first_variant_mismatch([record(bowl, variant=5, referent="random", seed=-7)]) is None, "no scene of ours"
-    other = (here[8] + 1) % 3
-    lines[1] = lines[1] | {"variant": other}
-    found = f"{bowl}, episode 1: variant {other} there, {here[8]} by its seed here"
-    assert first_variant_mismatch(lines) == found
-    for line in lines:
-        EpisodeLog(tmp_path).append(line)
-    write_card(tmp_path, with_episodes(card(), lines))
-    for name, line in zip(("part", "old"), lines, strict=True):
-        EpisodeLog(tmp_path / name).append(line)
-    for use in (
-        lambda: resumed_card(tmp_path, card(), print),
-        lambda: check_version(read_evaluation(tmp_path)),
-        lambda: merge(tmp_path / "out", [tmp_path / "part", tmp_path / "old"]),
-    ):
-        with pytest.raises(MemobenchError, match=found):
-            use()

@@ -11,12 +11,13 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import read_episodes, write_episodes
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.run.plan import EvaluationPlan, plan_line
 from lerobot_memobench.tasks.libero_suites import libero_tasks
 from tests.support.fake_loop import FakeLoop, content, make_checkpoint, results
+from tests.support.logs import write_log
 
 SOUP, CHEESE = libero_tasks("libero_object")[:2]
 RANDOM = ["env=memobench", "policy=memobench_random"]
@@ -213,7 +214,7 @@ def test_tables_hold_ids_in_liberos_order(fake_loop: FakeLoop, capsys: pytest.Ca
 def test_replan_intervals_are_drawn(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
     assert lerobot([*COMMAND, "output_dir=out"]) == 0
     for steps in (1, 5):
-        write_episodes(Path(f"k{steps}"), [{**line, "replan_steps": steps} for line in read_episodes(Path("out"))])
+        write_log(Path(f"k{steps}"), [{**line, "replan_steps": steps} for line in read_episodes(Path("out"))])
     assert memobench(["report", "A=k1", "A=k5", "--figures", "figures"]) == 0
     assert {path.name for path in Path("figures").glob("*.png")} == {"outcomes.png", "replan.png"}
     assert "Suites by replan" in capsys.readouterr().out
@@ -238,7 +239,7 @@ def test_suites_are_averaged(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[
     assert memobench(["report", "A=a", "B=long", "B=spatial", "--format", "markdown"]) == 0
     shown = capsys.readouterr().out
     assert "| evaluation | inputs | k | libero\\_spatial SR | libero\\_10 SR | average SR |".replace("\\", "") in shown
-    assert "| B | not recorded | – | **50.0** | **100.0** | **75.0** |" in shown
+    assert "| B | nothing | – | **50.0** | **100.0** | **75.0** |" in shown
     assert memobench(["report", "A=a", "B=long", "B=spatial"]) == 0
     shown = capsys.readouterr().out
     assert ["spat.", "10", "aver."] in [line.split() for line in shown.splitlines()]

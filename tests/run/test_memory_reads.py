@@ -11,16 +11,22 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.episode_log import write_episodes
-from lerobot_memobench.envs.memobench_env import MemobenchEnv
-from lerobot_memobench.envs.settings import OBJECTS, RESET
+from lerobot_memobench.envs.env import MemobenchEnv
+from lerobot_memobench.envs.settings import OBJECTS, RESET, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import page_data, write_html
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.policies.memory_reads import Chunk, EpisodeReads, ReadLog, find_reads, reads_file, write_reads
+from lerobot_memobench.policies.memory_reads import (
+    Chunk,
+    EpisodeReads,
+    find_reads,
+    noting_reads,
+    reads_file,
+    write_reads,
+)
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import merge
-from tests.support.logs import record
+from tests.support.logs import record, write_log
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 MILK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -49,8 +55,7 @@ def steps_of(folder: Path, episode: int) -> list[int] | None:
 def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
     chunks: list[Chunk] = [{"step": step, "entries": [0], "weights": [1.0]} for step in range(3)]
     policy: Any = Policy(chunks[:2], [], chunks[:1])
-    log = ReadLog(tmp_path, 20, "fixed")
-    with log.noting("a_task", policy, [20, 21, 22]) as ended:
+    with noting_reads(tmp_path, EnvSettings(seed_base=20), "a_task", policy, [20, 21, 22]) as ended:
         ended(np.array([False, False, False]))
         assert not (tmp_path / "memory_reads").exists()
         ended(np.array([True, True, False]))
@@ -65,7 +70,7 @@ def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
 
 def test_a_rollout_that_fails_writes_no_part_of_an_episode(tmp_path: Path) -> None:
     policy: Any = Policy([{"step": 0, "entries": [0], "weights": [1.0]}])
-    with pytest.raises(ZeroDivisionError), ReadLog(tmp_path, 7, "fixed").noting("a_task", policy, [7]):
+    with pytest.raises(ZeroDivisionError), noting_reads(tmp_path, EnvSettings(), "a_task", policy, [7]):
         raise ZeroDivisionError
     assert not policy.watched
     assert not reads_file(tmp_path, "a_task", 0).exists()
@@ -77,7 +82,8 @@ def test_reads_of_evidence_belong_to_their_episode(tmp_path: Path) -> None:
     for part, number in (("a", 0), ("a", 1), ("b", 2), ("b", 3)):
         env = gym.vector.SyncVectorEnv([partial(evidence, tmp_path / part)])
         policy: Any = Policy([{"step": 0, "entries": [0], "weights": [number / 10]}])
-        with ReadLog(tmp_path / part, 20_000, "drawn").noting(MILK, policy, [20_000 + number]) as ended:
+        settings = env.envs[0].settings
+        with noting_reads(tmp_path / part, settings, MILK, policy, [20_000 + number]) as ended:
             env.reset(seed=[20_000 + number])
             truncated = np.zeros(1, np.bool_)
             while not truncated.any():  # the execution begins with a hold
@@ -173,7 +179,7 @@ def test_a_damaged_file_is_left_out_with_a_note(tmp_path: Path, content: bytes) 
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()
     path.write_bytes(content)
-    write_episodes(tmp_path, [ROLLOUT])
+    write_log(tmp_path, [ROLLOUT])
     written = write_html([tmp_path], tmp_path / "html")
     assert len(written.notes) == 1
     assert str(path) in written.notes[0]

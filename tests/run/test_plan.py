@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.protocol import SPLITS
+from lerobot_memobench.run.card import card_of, run_facts
 from lerobot_memobench.run.command_line import parse_words
 from lerobot_memobench.run.plan import (
     EvaluationPlan,
@@ -28,9 +30,10 @@ from lerobot_memobench.run.plan import (
     plan_line,
     take_run_options,
 )
-from lerobot_memobench.run.settings import EvaluationSettings
-from lerobot_memobench.sim.libero import files
+from lerobot_memobench.run.settings import settings_of
+from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
+from tests.support.logs import card
 
 BARE = ["env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4"]
 LINE = [*BARE, "policy=memobench_random"]
@@ -107,7 +110,7 @@ def test_settings_are_typed_and_completed(
     plan = plan_line([*BARE, *words])
     assert {name: facts(plan)[name] for name in found} == found
     # The settings on a card make the same plan again.
-    asked = replace(EvaluationSettings(**plan.settings.portable), output_dir="out")
+    asked = replace(settings_of(card_of(plan)), output_dir="out")
     if "path" in asked.policy:
         asked = replace(asked, policy={**asked.policy, "path": str(plan.policy_path)})
     assert facts(make_plan(asked, plan.options, ())) == facts(plan)
@@ -198,10 +201,8 @@ def test_a_checkpoint_gets_the_inputs_it_was_trained_on(seen: tuple[str, ...], s
     assert plan_line([*BARE, f"policy={shipped}"]).settings.portable["policy"]["path"] == "memobench_strict"
 
 
-@pytest.mark.parametrize("name", ["evaluation.json", "card.json"])
-def test_resume_keeps_the_earlier_batch_size(name: str) -> None:
-    Path("out").mkdir()
-    Path("out", name).write_text(json.dumps({"protocol": {}, "runs": [{"batch_size": 4}]}))
+def test_resume_keeps_the_earlier_batch_size() -> None:
+    write_evaluation(Path("out"), card({}, runs=[{**run_facts([], 4)}]))
     assert plan_line([*LINE, "output_dir=out", "resume=true"]).batch == 4
     assert plan_line([*LINE, "output_dir=out", "resume=true", "batch_size=2"]).batch == 2
     assert plan_line([*LINE, "output_dir=new", "shards=2"]).batch == 1
@@ -277,7 +278,7 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "mine_of_test").mkdir()
     (tmp_path / "mine_of_test" / "__init__.py").write_text(
         "from dataclasses import dataclass\n"
-        "from lerobot_memobench.policies.baselines.configuration_baselines import MemobenchRandomConfig\n"
+        "from lerobot_memobench.policies.baselines import MemobenchRandomConfig\n"
         "from lerobot.configs import PreTrainedConfig\n"
         "@PreTrainedConfig.register_subclass('mine_of_test')\n@dataclass\n"
         "class Mine(MemobenchRandomConfig):\n    spread: float = 1.0\n    label: str = ''\n"

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs import episode
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY, read_episodes
-from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.episode_log import read_episodes
+from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, read_evaluation
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memory_reads import ReadLog, find_reads
+from lerobot_memobench.policies.memory_reads import find_reads, noting_reads
 from lerobot_memobench.run import evaluate as evaluation
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, batch_seed, roll
 from lerobot_memobench.sim.object_layout import SIZE
@@ -83,7 +83,7 @@ def rolled(
     name: str,
     videos: int = 0,
     obs_type: str = PIXELS,
-    reads: ReadLog | None = None,
+    reads: bool = False,
     **fields: Any,
 ) -> NDArray[np.float32]:
     """Return the actions (rows, steps, 7) of a fresh policy in fresh environments, by LeRobot's loop or ours."""
@@ -109,7 +109,7 @@ def rolled(
             lerobot_eval.rollout(env=env, policy=policy.eval(), seeds=seeds, render_callback=None, **processors)
         else:
             actor = Actor(policy.eval(), (env_before, before), (after, env_after))
-            with nullcontext() if reads is None else reads.noting(HIGHLIGHT, policy, seeds) as ended:
+            with noting_reads(log, config.settings, HIGHLIGHT, policy, seeds) if reads else nullcontext() as ended:
                 roll(env, actor, seeds, ended)
     finally:
         env.close()
@@ -277,7 +277,7 @@ def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> 
 def test_memory_reads_are_written_as_episodes_end(tmp_path: Path) -> None:
     name, fields, _ = CASES["memory of every fourth"]
     plain = rolled(False, 2, tmp_path / "plain", name, **fields)
-    noted = rolled(False, 2, tmp_path / "noted", name, reads=ReadLog(tmp_path / "noted", 7, "fixed"), **fields)
+    noted = rolled(False, 2, tmp_path / "noted", name, reads=True, **fields)
     np.testing.assert_array_equal(noted, plain)
     records = read_episodes(tmp_path / "noted")
     found, notes = find_reads(tmp_path / "noted", records, {})

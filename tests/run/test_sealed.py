@@ -12,7 +12,7 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.datasets.generation import generate
+from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.envs.episode import Episode, generator, referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline

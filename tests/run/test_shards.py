@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,44 +13,35 @@ import pytest
 from lerobot_memobench.cli.lerobot import SHARD_PROGRAM
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
-from lerobot_memobench.envs.episode_log import EpisodeLog, read_episodes
-from lerobot_memobench.envs.evaluation_file import read_evaluation, write_protocol
+from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episodes
+from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation, write_facts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_protocol
 from lerobot_memobench.run import shards
-from lerobot_memobench.run.card import new_card, policy_facts, run_facts, write_card
+from lerobot_memobench.run.card import policy_facts, run_facts
 from lerobot_memobench.run.plan import plan_line
 from lerobot_memobench.run.shards import merge, merge_and_report, part_folders, plan_shards
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop
-from tests.support.logs import MISSING, SETTINGS
+from tests.support.logs import MISSING, SETTINGS, card, facts, record
 
 COMMAND = ["eval", "env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "batch_size=2"]
 LINE = [*COMMAND[1:], "policy=memobench_random", "output_dir=out"]
 
 
+KNOWN = {"type": "act", "identity": "act 1"}
+
 # --- merging ---
 
 
-def part(folder: Path, episodes: list[int], task: str = "a", settings: Any = SETTINGS, **changes: Any) -> Path:
-    """Write a part: its log with protocol, and its videos and memory reads."""
-    log = EpisodeLog(folder, settings and partial(write_protocol, folder, settings))
+def part(
+    folder: Path, episodes: list[int], task: str = "a", settings: Any = SETTINGS, policy: Any = None, **changes: Any
+) -> Path:
+    """Write a part: its file, log, videos and memory reads."""
+    write_facts(folder, facts(settings, policy))
+    log = EpisodeLog(folder)
     for k in episodes:
-        log.append(
-            {
-                "task": task,
-                "memory_type": "temporal",
-                "episode": k,
-                "seed": 7 + k,
-                "referent": "fixed",
-                "success": True,
-                "steps": 100 + k,
-                "checkpoints": [{"operation": "S", "first_step": 3, "ordered_step": 3}],
-                "scene_hash": f"{k}",
-                "wall_s": 1.0,
-                **changes,
-            }
-        )
+        own = {"steps": 100 + k, "scene_hash": f"{k}", "wall_s": 1.0}
+        log.append(line_of(record(task, k, **own | changes)))
         for file in (f"videos/{task}.{k}.mp4", f"memory_reads/{task}.{k}.json.gz"):
             (folder / file).parent.mkdir(exist_ok=True)
             (folder / file).write_text(f"{file} of {k}")
@@ -59,17 +49,15 @@ def part(folder: Path, episodes: list[int], task: str = "a", settings: Any = SET
 
 
 def with_card(folder: Path, shard: str, policy: str = "act", task_hash: str = "1") -> Path:
-    card = new_card(
-        protocol={**SETTINGS, "tasks": ["a"], "episodes": 4},
-        policy=policy_facts({"type": policy}, 7),
-        checkpoint=None,
-        trained_on=None,
+    content = card(
+        {**SETTINGS, "tasks": ["a"], "episodes": 4},
+        policy_facts({"type": policy}, 7),
         task_files={"a": task_hash},
         settings={"env": {"tasks": "a"}},
         runs=[run_facts(["lerobot", "eval", f"shard={shard}"], 1)],
         shard=shard,
     )
-    write_card(folder, card)
+    write_evaluation(folder, content)
     return folder
 
 
@@ -80,21 +68,20 @@ def test_logs_videos_protocol_and_card_are_merged(tmp_path: Path) -> None:
     assert MISSING.format(2, 4, "a", 1) in str(found.missing).replace(", in part 1/2 of an evaluation", "")
     assert merge_and_report(out, parts).missing is None
     assert [record["episode"] for record in read_episodes(out)] == [0, 1, 2, 3]
-    assert read_protocol(out) == {**SETTINGS, "tasks": ["a"], "episodes": 4, "policy": policy_facts({"type": "act"}, 7)}
     assert os.path.samefile(out / "videos" / "a.2.mp4", tmp_path / "p0" / "videos" / "a.2.mp4")
     assert sorted(path.name for path in (out / "memory_reads").iterdir()) == [f"a.{k}.json.gz" for k in range(4)]
-    card = read_evaluation(out)
-    assert len(card["episodes"]) == 4
-    assert [run["command"][-1] for run in card["runs"]] == ["shard=1/2", "shard=2/2"]
-    assert card["shard"] is None
+    merged = read_evaluation(out)
+    assert merged["protocol"] == {**SETTINGS, "tasks": ["a"], "episodes": 4}
+    assert merged["policy"] == policy_facts({"type": "act"}, 7)
+    assert [run["command"][-1] for run in merged["runs"]] == ["shard=1/2", "shard=2/2"]
+    assert merged["shard"] is None
     # Once more, and with a part that came later and has no card.
     before = (out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes()
     merge(out, parts)
     assert before == ((out / "evaluation.json").read_bytes(), (out / "episodes.jsonl").read_bytes())
-    settings = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
-    merge(out, [part(tmp_path / "later", [0], task="b", settings=settings)])
+    merge(out, [part(tmp_path / "later", [0], task="b", policy=KNOWN)])
     assert len(read_episodes(out)) == 5
-    assert set(read_evaluation(out)) == {"format", "protocol"}
+    assert set(read_evaluation(out)) == {"format", "protocol", "policy"}
 
 
 def test_an_episode_in_two_parts_counts_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,7 +95,7 @@ def test_an_episode_in_two_parts_counts_once(tmp_path: Path, monkeypatch: pytest
     assert (tmp_path / "out" / "videos" / "a.0.mp4").read_text() == "videos/a.0.mp4 of 0"  # copied
 
 
-KNOWN = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
+OTHERWISE = {"settings": {**SETTINGS, "horizon": 600}}
 
 
 @pytest.mark.parametrize(
@@ -117,12 +104,10 @@ KNOWN = {**SETTINGS, "policy": {"type": "act", "identity": "act 1"}}
         ({}, {"success": False}, "success is True"),
         ({}, {"scene_hash": "other"}, "scene_hash"),
         ({}, {"checkpoints": [{"operation": "S", "first_step": 4, "ordered_step": 4}]}, "first_step of checkpoint 1"),
-        ({}, {"settings": {**SETTINGS, "horizon": 600}}, "horizon: 1200 and 600"),
-        ({"settings": None}, {"settings": None, "referent": "random"}, "referent: fixed and random"),
-        ({"policy": "act 1"}, {"policy": "act 2"}, "act 2"),
-        ({"policy": "act 1"}, {"settings": None}, "does not name the policy"),
-        ({"settings": KNOWN}, {"settings": None}, "does not name the policy"),
-        ({"card": "1/2"}, {"settings": None}, "does not name the policy"),
+        ({}, OTHERWISE, "horizon: 1200 and 600"),
+        ({"policy": KNOWN}, {"policy": {**KNOWN, "identity": "act 2"}}, "act 2"),
+        ({"policy": KNOWN}, {}, "does not name the policy"),
+        ({"card": "1/2"}, {}, "does not name the policy"),
         ({"card": "1/2"}, {"card": "2/2", "other": {"policy": "diffusion"}}, r"policy\.type: act and diffusion"),
         ({"card": "1/2"}, {"card": "2/2", "other": {"task_hash": "2"}}, "task files"),
     ],
@@ -142,11 +127,11 @@ def test_parts_that_disagree_are_refused(tmp_path: Path, x: dict[str, Any], y: d
 
 
 def test_parts_without_a_policy_are_merged_with_a_note(tmp_path: Path) -> None:
-    parts = [part(tmp_path / name, [k], settings=None) for k, name in enumerate("xy")]
+    parts = [part(tmp_path / name, [k]) for k, name in enumerate("xy")]
     unnamed = merge_and_report(tmp_path / "out", parts)
     assert len(unnamed.notes) == 1
     assert headline([unnamed]).startswith("policy not recorded: ")
-    named = merge_and_report(tmp_path / "named", [part(tmp_path / "z", [0], settings=KNOWN)])
+    named = merge_and_report(tmp_path / "named", [part(tmp_path / "z", [0], policy=KNOWN)])
     assert (named.notes, headline([named])[:6]) == ([], "act 1:")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 from lerobot_memobench import doctor
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.libero import fetch, files
+from lerobot_memobench.sim import files
 from tests.support.hub_server import Hub
 
 CONTENT = {"scenes/kitchen.xml": b"<mujoco/>", "stable_scanned_objects/plate/texture.png": b"white", "wood.png": b"oak"}
@@ -38,66 +38,51 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def write(folder: Path) -> Path:
+PLACES = {
+    "variable": "chosen",
+    "configuration": "other/libero/libero/assets",
+    "download": ".cache/libero/assets",
+    "hub": "hub/datasets--lerobot--libero-assets/snapshots/0a1b",
+    "package": "site-packages/assets_of_a_test/assets",
+    "checkout": "LIBERO/libero/libero/assets",
+    "other configuration": "other/libero/libero/assets",
+}
+"""Place -> its folder below the home folder, the first five in their order."""
+IN_ORDER = [*PLACES][:5]
+
+
+def install(place: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Write the assets to a place, and return their folder."""
+    folder = home / PLACES[place]
     for name, content in CONTENT.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
+    match place:
+        case "variable":
+            monkeypatch.setenv(files.ASSETS_VARIABLE, "~/chosen")
+        case "checkout":
+            monkeypatch.setenv(files.ASSETS_VARIABLE, str(home / "LIBERO"))
+        case "configuration" | "other configuration":
+            settings = home / (".libero" if place == "configuration" else "settings")
+            settings.mkdir()
+            (settings / "config.yaml").write_text(f"assets: {folder.parent}/./assets\nbddl_files: /none\n")
+            if place != "configuration":
+                monkeypatch.setenv("LIBERO_CONFIG_PATH", str(settings))
+        case "hub":  # as huggingface_hub does, links to files named by their hashes
+            (folder.parents[1] / "blobs").mkdir()
+            for name, content in CONTENT.items():
+                blob = folder.parents[1] / "blobs" / hashlib.sha256(content).hexdigest()
+                (folder / name).rename(blob)
+                (folder / name).symlink_to(blob)
+        case "package":
+            monkeypatch.setattr(files, "PACKAGE", "assets_of_a_test")
+            monkeypatch.syspath_prepend(str(home / "site-packages"))
     return folder
 
 
-def by_variable(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(files.ASSETS_VARIABLE, "~/chosen")
-    return write(home / "chosen")
-
-
-def by_checkout(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv(files.ASSETS_VARIABLE, str(home / "LIBERO"))
-    return write(home / "LIBERO/libero/libero/assets")
-
-
-def by_configuration(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = write(home / "other/libero/libero/assets")
-    (home / ".libero").mkdir()
-    (home / ".libero/config.yaml").write_text(f"assets: {folder.parent}/./assets\nbddl_files: /none\n")
-    return folder
-
-
-def by_other_configuration(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = by_configuration(home, monkeypatch)
-    (home / ".libero").rename(home / "settings")
-    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(home / "settings"))
-    return folder
-
-
-def by_download(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    return write(home / ".cache/libero/assets")
-
-
-def by_hub_cache(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write a snapshot as huggingface_hub does, of links to files named by their hashes."""
-    folder = write(home / "hub/datasets--lerobot--libero-assets/snapshots/0a1b")
-    (folder.parents[1] / "blobs").mkdir()
-    for name, content in CONTENT.items():
-        blob = folder.parents[1] / "blobs" / hashlib.sha256(content).hexdigest()
-        (folder / name).rename(blob)
-        (folder / name).symlink_to(blob)
-    return folder
-
-
-def by_package(home: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(files, "PACKAGE", "assets_of_a_test")
-    monkeypatch.syspath_prepend(str(home / "site-packages"))
-    return write(home / "site-packages/assets_of_a_test/assets")
-
-
-Source = Callable[[Path, pytest.MonkeyPatch], Path]
-IN_ORDER = (by_variable, by_configuration, by_download, by_hub_cache, by_package)
-ALL = (*IN_ORDER, by_checkout, by_other_configuration)
-
-
-@pytest.mark.parametrize("source", ALL, ids=lambda source: source.__name__)
-def test_each_place_is_found(source: Source, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = source(home, monkeypatch)
+@pytest.mark.parametrize("place", PLACES)
+def test_each_place_is_found(place: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = install(place, home, monkeypatch)
     assert files.check_assets().resolve() == folder
     assert files.asset(PLATE).read_bytes() == CONTENT[PLATE]
     finding = doctor.assets()
@@ -107,11 +92,11 @@ def test_each_place_is_found(source: Source, home: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("damage", ["missing", "other", "folder"])
-@pytest.mark.parametrize("source", ALL, ids=lambda source: source.__name__)
+@pytest.mark.parametrize("place", PLACES)
 def test_a_damaged_place_is_named_and_not_used(
-    source: Source, damage: str, home: Path, monkeypatch: pytest.MonkeyPatch
+    place: str, damage: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = source(home, monkeypatch)
+    folder = install(place, home, monkeypatch)
     path = folder / PLATE
     if damage == "other":
         path.write_bytes(b"black")  # the same size
@@ -127,16 +112,16 @@ def test_a_damaged_place_is_named_and_not_used(
     finding = doctor.assets()
     assert (finding.status, finding.fix) == ("failed", files.OBTAIN)
     assert named in finding.detail
-    if source is not by_package:
-        other = by_package(home, monkeypatch)
+    if place != "package":
+        other = install("package", home, monkeypatch)
         assert files.check_assets() == other
         finding = doctor.assets()
-        assert finding.status == ("warning" if source in (by_variable, by_checkout) else "ok")
+        assert finding.status == ("warning" if place in ("variable", "checkout") else "ok")
         assert named in finding.detail
 
 
 def test_order_of_places(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folders = [source(home, monkeypatch) for source in IN_ORDER]
+    folders = [install(place, home, monkeypatch) for place in IN_ORDER]
     for folder, following in pairwise(folders):
         assert files.check_assets().resolve() == folder
         (folder / "wood.png").unlink()
@@ -164,14 +149,14 @@ def test_a_machine_without_assets_gets_one_sentence(
 
 @pytest.mark.parametrize("content", ["", "assets", "[1]", "assets: 3", "assets: [", "\x00", "assets: ~/\n  - b: :"])
 def test_unusable_configurations_are_ignored(content: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = by_package(home, monkeypatch)
+    folder = install("package", home, monkeypatch)
     (home / ".libero").mkdir()
     (home / ".libero/config.yaml").write_text(content)
     assert files.check_assets() == folder
 
 
 def test_files_are_hashed_once_for_all_processes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = by_package(home, monkeypatch)
+    folder = install("package", home, monkeypatch)
     files.check_assets()
     hashed, real = [], files.file_hash
     monkeypatch.setattr(files, "file_hash", lambda path: hashed.append(path) or real(path))
@@ -192,7 +177,7 @@ def test_files_are_hashed_once_for_all_processes(home: Path, monkeypatch: pytest
 def test_a_cache_that_cannot_be_written(home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    folder = by_package(home, monkeypatch)
+    folder = install("package", home, monkeypatch)
     assert files.check_assets() == folder
 
 
@@ -229,10 +214,10 @@ def test_download_and_copy(hub: Hub, home: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_damaged_download_is_fetched_again(hub: Hub, home: Path) -> None:
-    folder = fetch.obtain().folder
+    folder = files.obtain().folder
     (folder / PLATE).resolve().write_bytes(b"black")
     files._verified.cache_clear()
-    assert fetch.obtain() == files.Place(files.HUB_CACHE, folder, "")
+    assert files.obtain() == files.AssetsFolder(files.HUB_CACHE, folder, "")
     assert files.asset(PLATE).read_bytes() == CONTENT[PLATE]
 
 
@@ -248,7 +233,7 @@ def test_other_files_on_the_hub_are_refused(hub: Hub, home: Path, capsys: pytest
 def test_copy_replaces_no_other_file(
     home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    by_package(home, monkeypatch)
+    install("package", home, monkeypatch)
     (home / "copy").mkdir()
     (home / "copy/wood.png").write_bytes(b"mine")
     (home / "file").write_text("")

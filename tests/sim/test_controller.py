@@ -1,27 +1,19 @@
-"""The arm moves as in the published stack, with equal torques, compiled or not."""
+"""The arm moves as in the published stack; the compiled torques equal NumPy's."""
 
 from __future__ import annotations
 
 import hashlib
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
-from numba.core import caching
 
-import lerobot_memobench.sim
-from lerobot_memobench.envs.episode import PROMPT, Episode
-from lerobot_memobench.sim import controller as control
-from lerobot_memobench.sim import osc_kernel, robot
-from lerobot_memobench.sim.controller import CompiledController, OSCController
-from lerobot_memobench.sim.scene import SUBSTEPS
+from lerobot_memobench.sim import robot
+from lerobot_memobench.sim.osc_kernel import KD, KP, NULLSPACE_KD, NULLSPACE_KP
 from lerobot_memobench.sim.simulation import NO_OP, STABILISATION_STEPS, Simulation
-from lerobot_memobench.tasks.catalogue import get_task
+from tests.sim.conftest import BOWLS, DRAWER
 
 FIGURES = Path(__file__).parent / "data" / "osc_trajectory.npz"
 """300 actions and, before each, end effector (position m, quaternion xyzw) and joints (rad) of the published stack's
@@ -32,23 +24,14 @@ class Arm:
     """The arm alone, stepped as `Simulation.step` steps it."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self.model, self.data = model, mujoco.MjData(model)
-        self.controller = OSCController(model)
-        joints = [int(model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
-        fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
-        self.data.qpos[joints] = robot.ARM_START
-        self.data.qpos[fingers] = robot.GRIPPER_START
+        self.model, self.data, self.controller = model, mujoco.MjData(model), robot.Controller(model)
+        self.data.qpos[: robot.OTHERS.start] = [*robot.ARM_START, *robot.GRIPPER_START]
         mujoco.mj_step1(model, self.data)
         self.controller.reset(self.data)
 
-    def step(self, action: np.ndarray, watch: Any = None) -> None:
+    def step(self, action: np.ndarray) -> None:
         self.controller.set_goal(self.data, action)
-        for _ in range(SUBSTEPS):
-            if watch is not None:
-                watch()
-            self.controller.apply(self.data, float(action[6]))
-            mujoco.mj_step2(self.model, self.data)
-            mujoco.mj_step1(self.model, self.data)
+        self.controller.advance(self.data, float(action[6]))
 
 
 def angle_between(matrix: np.ndarray, quaternion_xyzw: np.ndarray) -> float:
@@ -90,178 +73,90 @@ def test_goals_and_gripper_follow_the_published_rules(arm_model: mujoco.MjModel)
     np.testing.assert_array_equal(arm.controller.goal_rotation, turned)
 
 
-# --- compiled steps equal numpy's bit for bit ---
-
-TASKS = (
-    "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-    "open_and_close_the_microwave",
-    "put_the_butter_into_the_bowl_from_the_prompt_video",
-)
-MOVES = np.random.default_rng(0).uniform(-1, 1, (20, 7))
-MOVES[::4, 3:6] = 0.0  # keeps the former orientation
+# --- compiled steps equal NumPy's bit for bit ---
 
 
-def by_numpy(sim: Simulation) -> Simulation:
-    """Give a simulation the numpy controller."""
-    sim._controller = OSCController(sim.model)
-    return sim
+class Reference(robot.Controller):
+    """The controller in NumPy, with sums in the order of the compiled one."""
+
+    def torques(self, data: mujoco.MjData) -> np.ndarray:
+        """Return the arm's unclipped torques (7,), Nm, for the present state."""
+        jacobian, full = np.zeros((6, self._model.nv)), np.zeros((self._model.nv, self._model.nv))
+        mujoco.mj_jacSite(self._model, data, jacobian[:3], jacobian[3:], self._site)
+        arguments = (data, full) if robot.FULLM_READS_DATA else (full, data.qM)
+        mujoco.mj_fullM(self._model, *arguments)
+        jacobian, mass, velocity = jacobian[:, robot.ARM], full[robot.ARM, robot.ARM], data.qvel[robot.ARM]
+        turn = product(self.goal_rotation, data.site_xmat[self._site].reshape(3, 3).T)
+        error = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        twist = product(jacobian, velocity)
+        force = KP * (self.goal_position - data.site_xpos[self._site]) - KD * twist[:3]
+        torque = KP * error - KD * twist[3:]
+        columns = solution(mass, jacobian.T)
+        inverse = product(jacobian, columns)
+        wrench = np.concatenate([solution(inverse[:3, :3], force), solution(inverse[3:, 3:], torque)])
+        pull = NULLSPACE_KP * (self._home - data.qpos[robot.ARM]) - NULLSPACE_KD * velocity
+        posture = product(mass, pull)
+        wrench -= solution(inverse, product(columns.T, posture))
+        return product(jacobian.T, wrench) + data.qfrc_bias[robot.ARM] + posture
+
+    def advance(
+        self, data: mujoco.MjData, gripper_action: float, substeps: int = robot.SUBSTEPS, *, gravity_only: bool = False
+    ) -> None:
+        change = robot.CLOSING_SIGNS * robot.GRIPPER_SPEED * np.sign(gripper_action)
+        (low, high), (shut, wide) = self._torque_limits, self._finger_range
+        for _ in range(substeps):
+            data.ctrl[robot.ARM] = np.clip(self.torques(data), low, high)
+            self.gripper = np.clip(self.gripper + change, -1.0, 1.0)
+            data.ctrl[robot.FINGERS] = (wide + shut) / 2 + (wide - shut) / 2 * self.gripper
+            mujoco.mj_step2(self._model, data)
+            mujoco.mj_step1(self._model, data)
 
 
-def simulation(task: str = TASKS[0]) -> Simulation:
-    sim = Simulation(get_task(task))
-    assert isinstance(sim._controller, CompiledController)
-    return sim
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return ``a @ b`` for a (n, k) and b (k,) or (k, m), summed in order."""
+    columns = b.reshape(len(b), -1)
+    return sum(a[:, k : k + 1] * columns[k : k + 1] for k in range(len(b))).reshape(len(a), *b.shape[1:])
 
 
-def bits(sim: Simulation) -> bytes:
-    parts = sim.state(), sim.data.ctrl, sim.data.qacc_warmstart, sim.data.qfrc_bias, sim._controller.gripper
-    return b"".join(part.tobytes() for part in parts)
+def solution(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return matrix⁻¹ b for a positive definite matrix (n, n) and b (n,) or (n, m), by Cholesky."""
+    factor, x = matrix.copy(), b.reshape(len(b), -1).copy()
+    for j in range(len(matrix)):
+        factor[j, j] = np.sqrt(factor[j, j])
+        factor[j + 1 :, j] /= factor[j, j]
+        factor[j + 1 :, j + 1 :] -= factor[j + 1 :, j : j + 1] * factor[j + 1 :, j]
+    for j in range(len(matrix)):
+        x[j] /= factor[j, j]
+        x[j + 1 :] -= factor[j + 1 :, j : j + 1] * x[j]
+    for j in reversed(range(len(matrix))):
+        x[j] /= factor[j, j]
+        x[:j] -= factor[j, :j, None] * x[j]
+    return x.reshape(b.shape)
 
 
-def moved(sim: Simulation) -> bytes:
-    """Reset, take `MOVES`, and return the bits of where that leads."""
-    sim.reset(7)
-    for move in MOVES:
-        sim.step(move)
-    return bits(sim)
-
-
-@pytest.fixture
-def undecided(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reset the decision of the process about the compiled controller."""
-    monkeypatch.setattr(control._Process, "agrees", None)
-
-
-@pytest.mark.parametrize("task", [TASKS[2], *(pytest.param(task, marks=pytest.mark.slow) for task in TASKS[:2])])
-def test_episodes_are_equal_bit_for_bit(task: str) -> None:
-    """The expert reaches, grasps and carries; every fourth step is random."""
-    compiled, plain = Episode(get_task(task)), Episode(get_task(task))
-    assert isinstance(compiled.sim._controller, CompiledController)
-    by_numpy(plain.sim)
-    for episode in (compiled, plain):
-        episode.reset(7)
-    for k in range(160):
-        if compiled.done:
-            break
-        action = np.zeros(7, np.float32) if compiled.phase == PROMPT else compiled.expert_action()
-        if k % 4 == 3 and compiled.phase != PROMPT:
-            action = MOVES[k % len(MOVES)]
-        compiled.step(action), plain.step(action)
-        assert bits(compiled.sim) == bits(plain.sim), f"step {k}"
-    assert control._Process.agrees, "no step was compared"
-    assert k > 50
-
-
-def test_a_snapshot_continues_equally_in_both() -> None:
-    sims = simulation(), by_numpy(simulation())
-    moved(sims[0]), moved(sims[1])
-    snapshot = sims[0].snapshot()
-    for sim in sims:
-        sim.restore(snapshot)
-        sim.step(NO_OP)
-    assert bits(sims[0]) == bits(sims[1])
-
-
-def test_threads_do_not_disturb_each_other() -> None:
-    expected = moved(simulation())
-    found: list[bytes] = []
-    threads = [threading.Thread(target=lambda: found.append(moved(simulation()))) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert found == [expected] * 3
-
-
-# --- fall back to numpy ---
-
-
-def without_a_place_for_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, osc_kernel.__name__)
-    monkeypatch.delattr(lerobot_memobench.sim, "osc_kernel")
-    monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
-
-
-def without_a_function_of_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Library:
-        mj_step1 = mj_step2 = mj_jacSite = None
-
-    monkeypatch.setattr(osc_kernel.ctypes, "CDLL", lambda _: Library())
-    monkeypatch.setattr(osc_kernel.ctypes, "cast", lambda *_: osc_kernel.ctypes.c_void_p(1))
-
-
-def with_a_newer_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its functions may have other signatures and must not be looked up."""
-    monkeypatch.setattr(control, "MUJOCO", (control.NEWEST_MUJOCO[0], control.NEWEST_MUJOCO[1] + 1))
-    monkeypatch.setattr(osc_kernel, "functions", lambda: pytest.fail("called by address"))
-
-
-@pytest.mark.usefixtures("undecided")
-@pytest.mark.parametrize("lacking", [without_a_place_for_the_cache, without_a_function_of_mujoco, with_a_newer_mujoco])
-def test_falls_back_to_numpy(
-    lacking: Callable[[pytest.MonkeyPatch], None], monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    expected = moved(simulation())
-    monkeypatch.setattr(control._Process, "agrees", None)
-    with monkeypatch.context() as patch:
-        lacking(patch)
-        sim = Simulation(get_task(TASKS[0]))
-        assert type(sim._controller) is OSCController
-        assert moved(sim) == expected
-    assert capfd.readouterr() == ("", "")
-    assert type(Simulation(get_task(TASKS[0]))._controller) is OSCController, "decided once per process"
-
-
-@pytest.mark.usefixtures("undecided")
-@pytest.mark.parametrize("fault", ["fails", "differs"])
-def test_the_first_step_decides(fault: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    """The step is numpy's if the compiled call fails or returns other numbers."""
-    expected = moved(by_numpy(simulation()))
-    calls: list[int] = []
-
-    def other_numbers(*arguments: Any) -> None:
-        calls.append(1)
-        if fault == "fails":
-            raise OSError("the cache cannot be read")
-        advance(*arguments)
-        arguments[8].qpos[0] = np.nextafter(arguments[8].qpos[0], 9)
-
-    advance = osc_kernel.advance
-    monkeypatch.setattr(osc_kernel, "advance", other_numbers)
-    sim = simulation()
-    assert moved(sim) == expected
-    assert control._Process.agrees is False
-    assert len(calls) == 1
-    assert capfd.readouterr() == ("", "")
-
-
-def arm_with(memory: int) -> tuple[mujoco.MjData, CompiledController]:
-    """Return an arm with limited simulation memory, bytes."""
-    spec = mujoco.MjSpec.from_string(robot.robot_xml())
-    spec.nconmax, spec.njmax, spec.memory = -1, -1, memory
-    model = spec.compile()
-    data, controller = mujoco.MjData(model), CompiledController(model)
-    mujoco.mj_step1(model, data)
-    controller.reset(data)
-    return data, controller
-
-
-@pytest.mark.parametrize(("times", "ways"), [(3.0, ["compiled"]), (1.5, ["numpy"])])
-def test_scarce_memory_uses_numpy(times: float, ways: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Out of memory, a call by address ends the process; the bindings used by numpy raise instead."""
-    data, controller = arm_with(2**20)
-    OSCController.advance(controller, data, -1.0, 1)
-    data, controller = arm_with(int(times * data.maxuse_arena))
-    OSCController.advance(controller, data, -1.0, 1)
-    taken: list[str] = []
-    monkeypatch.setattr(control._Process, "agrees", True)
-    monkeypatch.setattr(CompiledController, "_advance", lambda *_: taken.append("compiled"))
-    monkeypatch.setattr(OSCController, "advance", lambda *_: taken.append("numpy"))
-    controller.advance(data, -1.0, 1)
-    assert taken == ways
+@pytest.mark.parametrize("task", [DRAWER, BOWLS])
+def test_compiled_steps_equal_numpy(simulate: Callable[..., Simulation], task: str) -> None:
+    """The hand moves at random; every fourth action keeps the former orientation."""
+    compiled, plain = simulate(task), simulate(task)
+    plain._controller = Reference(plain.model)
+    plain.restore(compiled.snapshot())
+    moves = np.random.default_rng(0).uniform(-1, 1, (60, 7))
+    moves[::4, 3:6] = 0.0
+    for k, move in enumerate(moves):
+        for sim in (compiled, plain):
+            sim.step(move)
+        np.testing.assert_array_equal(compiled.snapshot().physics, plain.snapshot().physics, err_msg=f"step {k}")
 
 
 # --- the carried arm ---
+
+
+def test_the_robot_comes_first_in_a_scene(simulate: Callable[..., Simulation]) -> None:
+    model = simulate(BOWLS).model
+    joints = [model.joint(name) for name in (*robot.ARM_JOINTS, *robot.FINGER_JOINTS)]
+    assert [joint.qposadr[0] for joint in joints] == [joint.dofadr[0] for joint in joints] == [*range(9)]
+    assert [model.actuator(k).trnid[0] for k in range(9)] == [joint.id for joint in joints]
+
 
 CARRIED = "e36735ac29316c701c722f5d41b46efc854356d1fdbc46ce611cbd1f02a5262b"
 """Hash of the names and contents that scripts/robosuite_arm.py writes."""

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.protocol import CAMERAS
-from lerobot_memobench.sim.hiding import PARKING_HEIGHT, HiddenObjects
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.world import PARKING_HEIGHT, HiddenObjects
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 

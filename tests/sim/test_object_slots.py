@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import POSE_RESOLUTION, ObjectSlots, classes
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
+from lerobot_memobench.sim.simulation import MJCF_CAMERAS, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from mujoco_raster.highlights import Highlight
 

@@ -14,11 +14,10 @@ from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.sim.world import DETENT_DISTANCE, PLACE_DISTANCE
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
+from tests.sim.conftest import BOWLS, DRAWER, STOVE
 
 Simulate = Callable[..., Simulation]
 TOMATO, CABINET = "beefsteak_tomato__1_1", "wooden_cabinet_1"
-STOVE = "turn_on_the_stove_and_turn_it_off"
-BOWLS = "put_the_butter_into_the_bowl_from_the_prompt_video"
 MICROWAVE = "open_and_close_the_microwave"
 
 
@@ -52,11 +51,10 @@ def holds(sim: Simulation, predicate: str, *args: str) -> bool:
 def test_joints_have_the_published_thresholds(
     simulate: Simulate, joint: str, name: str, predicate: str, true_at: float, false_at: float
 ) -> None:
-    sim = simulate({"w": "put_the_tomato_into_the_top_drawer_of_the_cabinet", "f": STOVE, "m": MICROWAVE}[joint[0]])
-    articulation, _ = sim.world.articulation(name)
-    turn(sim, articulation.joint, true_at)
+    sim = simulate({"w": DRAWER, "f": STOVE, "m": MICROWAVE}[joint[0]])
+    turn(sim, joint, true_at)
     assert holds(sim, predicate, name)
-    turn(sim, articulation.joint, false_at)
+    turn(sim, joint, false_at)
     assert not holds(sim, predicate, name)
 
 

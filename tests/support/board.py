@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.submission import CARD, LOG
-from lerobot_memobench.datasets.generation import task_hash
+from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.policies.lerobot_config import tree_hash
 from lerobot_memobench.protocol import EVIDENCE_EPISODES
-from lerobot_memobench.run.card import new_card, with_episodes, write_card
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance, scene_and_variant
 from lerobot_memobench.tasks.task import STRICT
+from tests.support.logs import card
 
 TASKS = task_names(suite=STRICT)
 ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
@@ -43,7 +44,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     scene, seed = episode, first + episode
     fixed = settings.get("referent") == "fixed"
     task = published if fixed else referent_of(published, seed)
-    suite = {"suite": STRICT, "lost": False} if published.suite == STRICT else {}
+    suite = {"lost": False, "held_steps": 0} if published.suite == STRICT else {}
     prompt_steps = published.prompt_steps if suite else 200 * (task.prompt is not None)
     if settings.get("evidence"):
         scene, variant = scene_and_variant(published, episode)
@@ -56,8 +57,7 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     choice |= {"variants": len(published.random_variants), "chance": chance(published)}
     return {
         **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed},
-        **{"referent": "drawn" if suite else settings["referent"]},
-        **{"variant": task.variant_index, "replan_steps": 5, "prompt_shown": None if task.prompt is None else True},
+        **{"variant": task.variant_index, "prompt_shown": None if task.prompt is None else True},
         **{"prompt_steps": prompt_steps, "steps": steps, "success": success},
         **(choice if settings.get("evidence") else {}),
         **({"paused_steps": steps // 50 * 100} if settings.get("pause_steps") else {}),
@@ -65,8 +65,8 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
             {"operation": c.operation, "first_step": step, "ordered_step": step if success else None}
             for c, step in zip(task.checkpoints, marks, strict=True)
         ],
-        **{"failure": None if success else "storage_failure", **suite, "world": "libero"},
-        **{"scene_hash": scene_of(name, seed), "wall_s": 2.0, "policy": "act 0123", "run": "r", "inputs": "pixels"},
+        **{"failure": None if success else "storage_failure", **suite},
+        **{"scene_hash": scene_of(name, seed), "wall_s": 2.0},
     }
 
 
@@ -76,18 +76,16 @@ def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = STRIC
     count = EVIDENCE_EPISODES if settings.get("evidence") else 10
     records = [line(name, episode, first, speed, **settings) for name in names for episode in range(count)]
     block = EnvSettings(suite=suite, seed_base=first, replan_steps=5, **settings).protocol_block
-    card = new_card(
-        protocol={"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
-        policy={"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
+    content = card(
+        {"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
+        {"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
         task_files={name: task_hash(get_task(name)) for name in names},
-        settings={},
         runs=[{"command": ["lerobot"], "batch_size": 1, "versions": VERSIONS, "git_commit": None, "machine": {}}],
     )
-    folder.mkdir(parents=True)
+    write_evaluation(folder, content)
     write_episodes(folder, records)
-    write_card(folder, with_episodes(card, records))
     return folder
 
 
@@ -98,15 +96,13 @@ def first_failure(records: list[Json]) -> Json:
     return next(record for record in records if not record["success"])
 
 
-def in_log(change: Callable[[list[Json]], object], *, card: bool = False) -> Callable[[Path], None]:
-    """A change of the log, and of the card's episodes with ``card``."""
+def in_log(change: Callable[[list[Json]], object]) -> Callable[[Path], None]:
+    """A change of the log."""
 
     def apply(folder: Path) -> None:
         lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
         change(lines)
         (folder / LOG).write_bytes(gzip.compress("".join(json.dumps(each) + "\n" for each in lines).encode()))
-        if card:
-            in_card(lambda content: change(content["episodes"]))(folder)
 
     return apply
 
@@ -133,9 +129,8 @@ def sealed(folder: Path) -> None:
             record["seed"] = 100_007 + record["episode"]
             task = get_task(record["task"])
             record["variant"] = referent_of(task, record["seed"], SALT).variant_index
-            record["salt"] = SALT
             record["scene_hash"] = scene_of(task.name, record["seed"])
 
-    in_log(move, card=True)(folder)
+    in_log(move)(folder)
     protocol = {"seed_base": 100_007, "salt": SALT}
     in_card(lambda card: (card["protocol"].update(protocol), card["policy"].update(seed=100_007)))(folder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,9 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
-from lerobot_memobench.envs.evaluation_file import write_protocol
 from lerobot_memobench.run.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
-from lerobot_memobench.tasks.task import LIBERO_SUITES, Task
+from lerobot_memobench.tasks.task import Task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 DRAWER = "check_the_top_drawer_of_the_cabinet"
@@ -51,7 +49,7 @@ class FakeLoop:
         self.cells.append(cells)
         begin()
         self.before(plan)
-        log = EpisodeLog(plan.log, partial(write_protocol, plan.log, plan.environment.settings.protocol_block))
+        log = EpisodeLog(plan.log)
         logged = read_episodes(plan.log) if has_log(plan.log) else []
         skipped = {(record["task"], record["episode"]) for record in logged}
         for cell in cells:
@@ -63,8 +61,7 @@ class FakeLoop:
                         raise Killed
                     self.kill_after -= 1
                 self.ran.append((name, episode))
-                record = self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode)
-                log.append(record | ({"salt": salt} if (salt := plan.environment.salt) else {}))
+                log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
             advance(len(self.ran), len(self.ran), cell[0].name)
 
     def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:
@@ -73,18 +70,14 @@ class FakeLoop:
             "memory_type": task.memory_type,
             "episode": episode,
             "seed": seed,
-            "referent": "fixed",
-            "replan_steps": None,
             "success": seed % 2 == 1,
             "steps": 100 + seed % 1000,
             "checkpoints": [
                 {"operation": c.operation, "first_step": seed, "ordered_step": seed} for c in task.checkpoints
             ],
             "failure": None if seed % 2 else "storage_failure" if task.checkpoints else "execution_failure",
-            **({"suite": task.suite, "convention": "libero"} if task.suite in LIBERO_SUITES else {}),
             "scene_hash": f"{task.name[:4]}{seed:012d}",
             "wall_s": 1.0,
-            "world": "libero",
             **self.changed,
         }
 
@@ -125,7 +118,6 @@ def content(folder: Path) -> dict[Path, bytes]:
 
 
 def results(folder: str) -> list[Any]:
-    """Return log, outcomes on the card and report of an evaluation, without times."""
+    """Return log and report of an evaluation, without times."""
     log = [{key: value for key, value in line.items() if key != "wall_s"} for line in read_episodes(Path(folder))]
-    card, report = (json.loads(Path(folder, name).read_text()) for name in ("evaluation.json", "report.json"))
-    return [log, card["episodes"], report]
+    return [log, json.loads(Path(folder, "report.json").read_text())]

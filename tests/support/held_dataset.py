@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.tasks.catalogue import DEMO_TASK
 from tests.support.short_demonstrations import drawn_steps, with_pictures
 

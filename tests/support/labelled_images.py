@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lerobot_memobench.perception.detector import GEOMETRY, CellQuery, DetectorOutput
-from lerobot_memobench.perception.geometry import rays
+from lerobot_memobench.perception.objects import rays
 from lerobot_memobench.perception.visual_encoder import SIDE, VisualEncoder
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation

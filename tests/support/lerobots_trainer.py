@@ -11,19 +11,19 @@ from contextlib import contextmanager
 import draccus
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.scripts import lerobot_train
 
-from lerobot_memobench.training import command
+from lerobot_memobench.training import trainer
 
 
-def run_in_this_process(config: TrainPipelineConfig, config_path: str | None) -> int:
-    from lerobot_memobench.training import samples
-
+def run_in_this_process(config: TrainPipelineConfig) -> int:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["samples", *([f"--config_path={config_path}"] if config.resume else [])])
+        path = config.checkpoint_path
+        patch.setattr(sys, "argv", ["trainer", *([f"--config_path={path / 'pretrained_model'}"] if path else [])])
         patch.setattr(sys, "stdin", io.StringIO(json.dumps(draccus.encode(config))))
-        patch.setattr(samples, "register_plugins", lambda: None)
-        patch.setattr(samples.lerobot_train, "make_train_eval_datasets", samples.open_datasets)
-        samples.main()
+        patch.setattr(trainer, "register_plugins", lambda: None)
+        patch.setattr(lerobot_train, "make_train_eval_datasets", None)  # restored at the end
+        trainer.main()
     return 0
 
 
@@ -31,5 +31,5 @@ def run_in_this_process(config: TrainPipelineConfig, config_path: str | None) ->
 def trainer_in_this_process() -> Iterator[None]:
     """Let ``lerobot train`` call LeRobot's trainer instead of starting a process."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "run_lerobot", run_in_this_process)
+        patch.setattr(trainer, "run_lerobot", run_in_this_process)
         yield

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lerobot_memobench.sim.libero.scene import scene_xml
-from lerobot_memobench.sim.scene import ARENA_BYTES
+from lerobot_memobench.sim.scene import ARENA_BYTES, scene_xml
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom

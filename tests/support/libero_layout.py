@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.sim.libero.scene import get_scene
+from lerobot_memobench.sim.scene import get_scene
 
 CAMERAS = {"agentview_image": "image", "robot0_eye_in_hand_image": "wrist_image"}
 LIBERO_CAMERAS = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}

@@ -28,7 +28,7 @@ def remembered(policy: Any, rows: Sequence[int]) -> list[tuple[Tensor, list[int]
     """Return the remembered frames of rows of a policy's rollout, and their control steps."""
     found = []
     for row in rows:
-        (kept,) = policy.rollout.rows[row].memory
+        (kept,) = policy.rollout.envs[row].memory
         read = [kept[slot] for slot in sample_frames(len(kept) - 1, policy.model.memory.settings.frames)]
         found.append((torch.stack([frame.stored for frame in read]), [frame.step for frame in read]))
     return found

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, OBJECTS, PRIVILEGED
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
+from lerobot_memobench.datasets.episodes import DemonstrationRecord
+from lerobot_memobench.datasets.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
-from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.tasks.catalogue import DEMO_TASK
 from tests.support.synthetic_dataset import clock_at
 
@@ -34,10 +33,25 @@ def state_at(hand: np.ndarray) -> np.ndarray:
     return np.array([*hand, 3.1, 0.05, 0.1, 0.03, -0.03], np.float32)
 
 
-def record_of(name: str, seed: int, prompt: int, world: str | None) -> str:
+def record_of(name: str, seed: int, prompt: int) -> str:
     """Return the record of an episode, as `memobench generate` writes it."""
-    told = {"memory_type": "object", "referent": "random", "variant": 0, "key_frames": [-1], "world": world}
-    return EpisodeRecord(task_name=name, seed=seed, exec_start_index=prompt, **told).in_frames()
+    return DemonstrationRecord(
+        task_name=name,
+        memory_type="object",
+        family="",
+        operations="S",
+        seed=seed,
+        referent="random",
+        variant=0,
+        success=True,
+        exec_start_index=prompt,
+        key_frames=[-1],
+        scene_hash="",
+        fixture_poses={},
+        digest="",
+        world="libero",
+        stand_ins=[],
+    ).in_frames()
 
 
 def make_object_dataset(
@@ -46,12 +60,11 @@ def make_object_dataset(
     pictures: bool = False,
     repeats: int = 1,
     records: bool = False,
-    world: str | None = LIBERO,
 ) -> Path:
     """Write episodes in which the hand moves to the one of three things that was lit in the prompt.
 
-    With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each names one of two tasks,
-    and ``world`` as the source of its scene.
+    With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each names one of two
+    tasks.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -93,7 +106,7 @@ def make_object_dataset(
                 "task": task,
             }
             if records:
-                frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt, world)
+                frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt)
             if pictures:
                 frame["observation.images.image"] = np.full((48, 48, 3), t, np.uint8)
             dataset.add_frame(frame)

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import Demonstration, labels
+from lerobot_memobench.datasets.demonstration import Demonstration, key_frames
 from lerobot_memobench.datasets.hdf5 import IMAGE_NAMES
 from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, Task
@@ -57,7 +57,7 @@ def write_foreign(path: Path, demo: Demonstration, **metadata: Any) -> Path:
 def demo_metadata(demo: Demonstration) -> dict[str, Any]:
     """Return ``meta_data``: the task's metadata with its frames filled in."""
     metadata = dict(demo.task.metadata)
-    metadata["key_frame"] = labels(demo).key_frames.tolist()
+    metadata["key_frame"] = key_frames(demo).tolist()
     as_list = isinstance(metadata.get("timestep_exec_start_idx"), list)
     metadata["timestep_exec_start_idx"] = [demo.exec_start] if as_list else demo.exec_start
     return metadata

@@ -9,8 +9,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
-from lerobot_memobench.policies.memobench_mem.losses import mean_losses
+from lerobot_memobench.policies.memobench_mem.losses import alignment_loss, make_alignment, mean_losses
 
 ROWS, FRAMES, TOKENS, DIM = 7, 2, 2, 5
 RANKS = (slice(0, 4), slice(4, ROWS))

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_memobench.policies.remote.configuration_remote import RemoteConfig
-from lerobot_memobench.policies.remote.modeling_remote import RemotePolicy
+from lerobot_memobench.policies.remote import RemoteConfig, RemotePolicy
 from tests.support.policy_server import PolicyServer, robomme
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -11,9 +11,9 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks import libero_suites
-from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.catalogue import suite_of, task_names
 from lerobot_memobench.tasks.formula import atoms
-from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_suite_of, libero_tasks
+from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 
@@ -37,7 +37,7 @@ def test_goals_are_conjunctions_of_libero_s_predicates() -> None:
     counts = Counter(atom.predicate for task in tasks for atom in atoms(task.goal))
     assert counts == {"in": 63, "on": 61, "close": 11, "turnon": 8, "open": 7, "turnoff": 1}
     assert not any(task.checkpoints or task.prompt or task.variants for task in tasks)
-    assert all(task.suite == task.memory_type == libero_suite_of(task.name) for task in tasks)
+    assert all(task.suite == task.memory_type == suite_of(task.name) for task in tasks)
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def test_missing_and_unreadable_files_are_named(write_task: Write, bddl: str, tm
     with pytest.raises(MemobenchError, match=r"task_config\.bddl"):
         load_task(tmp_path)
     (folder / "task_config.bddl").write_bytes(b"(define \xff")
-    with pytest.raises(MemobenchError, match="offset 8"):
+    with pytest.raises(MemobenchError, match="position 8"):
         load_task(folder)
 
 
@@ -281,6 +281,3 @@ def refusal(folder: Path) -> str:
     except MemobenchError as error:
         return str(error)
     return ""
-
-
-# --- worlds and memory texts ---

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -44,16 +45,19 @@ def train() -> Callable[..., None]:
 
     def run(*words: str) -> None:
         from lerobot_memobench.run.command_line import parse_words, read_words
-        from lerobot_memobench.training.command import complete_training
-        from lerobot_memobench.training.configuration import complete
+        from lerobot_memobench.training.command import complete_training, with_last_checkpoint
         from lerobot_memobench.training.loop import train as loop
-        from lerobot_memobench.training.resume import resumed
 
-        given = resumed(parse_words(["policy.device=cpu", "seed=3", *words]))
-        asked, config = complete_training(read_words("train", given))
-        loop(complete(config, asked))
+        given = with_last_checkpoint(parse_words(["policy.device=cpu", "seed=3", *words]))
+        loop(complete_training(read_words("train", given)))
 
     return run
+
+
+def read_losses(run: Path) -> list[tuple[int, str, str, float]]:
+    """Return step, ``train`` or ``eval``, name and value of each row of a run's log."""
+    with (run / "losses.csv").open(newline="") as file:
+        return [(int(step), mode, name, float(value)) for step, mode, name, value in [*csv.reader(file)][1:]]
 
 
 def hashes(checkpoint: Path) -> dict[str, str]:

@@ -1,75 +1,54 @@
-"""Settings that a training refuses before it starts, and checkpoints of earlier versions."""
+"""Settings and datasets that a training refuses before it starts."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+import re
+from dataclasses import fields
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from lerobot.configs.default import DatasetConfig, EvalConfig, JobConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.sim.scene_hash import LIBERO
-from lerobot_memobench.training.configuration import READ, check_settings
-from lerobot_memobench.training.data import check_dataset_version, open_datasets
+from lerobot_memobench.run.command_line import parse_words, read_words
+from lerobot_memobench.training.command import READ, check_settings, complete_training
+from lerobot_memobench.training.data import open_metadata
 from lerobot_memobench.training.loop import begin
-from tests.support.object_dataset import make_object_dataset
+
+LEROBOTS = [  # checks of LeRobot's configuration
+    ("eval_steps=2", "dataset.eval_split"),
+    ("rename_map={a: b}", "rename_map"),
+    ("save_checkpoint_to_hub=true", "policy.repo_id"),
+    ("use_policy_training_preset=false", "Optimizer"),
+]
 
 
-def config(**settings: Any) -> TrainPipelineConfig:
+def config() -> TrainPipelineConfig:
     policy = MemobenchMemConfig(device="cpu", push_to_hub=False)
-    return TrainPipelineConfig(DatasetConfig("memobench/synthetic"), policy=policy, **settings)
-
-
-@pytest.mark.parametrize("word", ["steps=0", "batch_size=-1", "num_workers=-1", "eval.n_episodes=0"])
-def test_too_small_numbers_are_refused(word: str, synthetic: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["train", "policy=act", f"dataset={synthetic}", word]) == 2
-    assert f"found {word}" in capsys.readouterr().err
+    return TrainPipelineConfig(DatasetConfig("memobench/synthetic"), policy=policy)
 
 
 @pytest.mark.parametrize(
-    ("changed", "named"),
+    ("policy", "word", "named"),
     [
-        ({"dataset": DatasetConfig("a/b", streaming=True)}, "dataset.streaming"),
-        ({"sample_weighting": SimpleNamespace()}, "sample_weighting"),
-        ({"job": JobConfig(target="a10g-small")}, "job.target=a10g-small has no effect"),
-        ({"reward_model": SimpleNamespace()}, "reward_model"),
-        ({"field_of_tomorrow": 3}, "field_of_tomorrow=3 has no effect"),
-        ({"eval": EvalConfig(recording=True)}, "eval.recording"),
-        ({"eval_steps": 2}, "dataset.eval_split"),
-        ({"rename_map": {"a": "b"}}, "rename_map"),
-        ({"save_checkpoint_to_hub": True}, "policy.repo_id"),
-        ({"use_policy_training_preset": False}, "optimizer.type"),
-        ({"parallelism": SimpleNamespace(is_sharded=True)}, "parallelism"),
-        ({"ema": SimpleNamespace(enable=True)}, "ema"),
-        ({"checkpoint_format": "dcp"}, "checkpoint_format"),
+        *(("act", word, f"found {word}") for word in ("steps=0", "batch_size=-1", "num_workers=-1")),
+        *(("act", *case) for case in LEROBOTS),
+        *(("memobench_mem", *case) for case in LEROBOTS),
+        ("act", "eval.n_episodes=0", "found eval.n_episodes=0"),
+        ("memobench_mem", "dataset.streaming=true", "dataset.streaming"),
+        ("memobench_mem", "job.target=a10g-small", "job.target=a10g-small has no effect"),
+        ("memobench_mem", "eval.recording=true", "eval.recording"),
+        ("memobench_mem", "policy.use_amp=true", "use_amp"),
+        ("memobench_mem", "output_dir=.", "resume=true"),
     ],
-    ids=lambda part: next(iter(part)) if isinstance(part, dict) else part,
 )
-def test_unsupported_settings_are_refused(changed: dict[str, Any], named: str) -> None:
-    check_settings(config())
-    asked = config()
-    for name, value in changed.items():
-        setattr(asked, name, value)
-    with pytest.raises(MemobenchError, match=named):
-        check_settings(asked)
-
-
-def test_demonstrations_of_former_scenes_are_refused(tmp_path: Path) -> None:
-    for world in (LIBERO, None):  # version 0.2 wrote none
-        root = make_object_dataset(tmp_path / str(world), records=True, world=world)
-        meta = LeRobotDatasetMetadata("memobench/objects", root=root)
-        if world is None:
-            with pytest.raises(MemobenchError, match=r"episode 0 of .* is of the scenes that version 0\.2"):
-                check_dataset_version(meta)
-        else:
-            check_dataset_version(meta)
+def test_settings_are_refused(policy: str, word: str, named: str) -> None:
+    asked = read_words("train", parse_words([f"policy={policy}", "device=cpu", word]))
+    with pytest.raises(MemobenchError, match=re.escape(named)):
+        complete_training(asked)
 
 
 def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:
@@ -77,13 +56,14 @@ def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:
     refused = {"job", "reward_model", "sample_weighting"}
     main = {"accelerator", "checkpoint_format", "ema", "parallelism"}
     assert READ | refused <= {field.name for field in fields(TrainPipelineConfig)} <= READ | refused | main
-
-
-def test_mixed_precision_and_accumulation_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = config()
-    asked.policy.use_amp = True  # type: ignore[union-attr]
-    with pytest.raises(MemobenchError, match="use_amp"):
+    asked: Any = config()
+    check_settings(asked)
+    asked.field_of_tomorrow = 3
+    with pytest.raises(MemobenchError, match="field_of_tomorrow=3 has no effect"):
         check_settings(asked)
+
+
+def test_accumulation_of_gradients_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ACCELERATE_GRADIENT_ACCUMULATION_STEPS", "4")
     with pytest.raises(MemobenchError, match="gradient_accumulation_steps=4"):
         begin(config())
@@ -100,12 +80,5 @@ def test_image_transforms_are_refused_if_images_are_encoded_once() -> None:
 
 @pytest.mark.parametrize(("episodes", "named"), [([7], r"\[7\]"), ([0, 3], r"\[3\]"), ([], r"\[\]")])
 def test_missing_episodes_are_refused(synthetic: Path, episodes: list[int], named: str) -> None:
-    asked = config()
-    asked.dataset = replace(asked.dataset, root=str(synthetic), episodes=episodes)
     with pytest.raises(MemobenchError, match=f"episodes={named}"):
-        open_datasets(asked)
-
-
-def test_existing_output_folder_is_refused(objects: Path, tmp_path: Path, train: Any) -> None:
-    with pytest.raises(MemobenchError, match="resume=true"):
-        train("policy=memobench_mem", f"dataset={objects}", f"output_dir={tmp_path}")
+        open_metadata(DatasetConfig("memobench/synthetic", root=str(synthetic), episodes=episodes))

@@ -26,7 +26,7 @@ class Encoder:
         self.calls: list[int] = []
 
     def features(self, key: str = "numbers") -> Features:
-        return Features(key, 2, 3, self.encode)
+        return Features(key, 6, self.encode)
 
     def encode(self, frames: torch.Tensor) -> torch.Tensor:
         return frames.view(-1, 1, 1).expand(-1, 2, 3)

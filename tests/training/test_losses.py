@@ -12,7 +12,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
-from lerobot_memobench.policies.memobench_mem.subgoals import texts_of
+from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from tests.support import rank_case
 from tests.support.fork_server import ForkServer
 from tests.support.small_policy import (
@@ -20,7 +20,6 @@ from tests.support.small_policy import (
     batch_of,
     draw_modulation,
     made_for_training,
-    open_small_training,
     small_config,
 )
 
@@ -40,18 +39,6 @@ def test_lerobots_batches_train_policies_without_memory(synthetic: Path, memory:
         return
     per_sample, _ = policy.train().forward(batch, reduction="none")
     assert (per_sample > 0).tolist() == [True, False, True], "the second frame is of a prompt"
-
-
-def test_recorded_samples_equal_lerobots(objects: Path) -> None:
-    """Frames at the start and at the end of episodes, where chunks are padded."""
-    training = open_small_training(objects, small_config(size="tiny", perception="objects"))
-    times = {"action": [step / 20 for step in range(CHUNK)]}
-    theirs, ours = LeRobotDataset("local/data", root=objects, delta_timestamps=times), training.samples()
-    for index in (0, 33, 34, 35, 39, 40, 62, 93):
-        expected, found = theirs[index], ours[index]
-        for name in ("action", "action_is_pad", "observation.state", "episode_index", "task_index"):
-            assert torch.equal(found[name], expected[name]), (index, name)
-        assert found["task"] == expected["task"]
 
 
 def test_padded_actions_do_not_count(synthetic: Path, monkeypatch: pytest.MonkeyPatch) -> None:

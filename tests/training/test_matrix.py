@@ -17,8 +17,7 @@ from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
 from lerobot_memobench.training.average import TRAINING_FILE
-from lerobot_memobench.training.log import LOSSES, read_losses
-from tests.training.conftest import hashes
+from tests.training.conftest import hashes, read_losses
 
 SEEN = {
     "objects": ("perception=objects", "size=tiny", "batch_size=50", "policy.chunk_size=4"),
@@ -50,9 +49,9 @@ def test_training_saves_resumes_to_the_bit_and_acts(
     straight = hashes(run / "checkpoints/000004")
     assert len(straight) > 100
     assert hashes(again / "checkpoints/000004") == straight
-    losses = [row for row in read_losses(run / LOSSES) if row[2] == "action_loss"]
+    losses = [row for row in read_losses(run) if row[2] == "action_loss"]
     assert [row[0] for row in losses] == [1, 2, 3, 4]
-    assert [row for row in read_losses(again / LOSSES) if row[2] == "action_loss"] == losses
+    assert [row for row in read_losses(again) if row[2] == "action_loss"] == losses
 
     checkpoint = run / "checkpoints/last/pretrained_model"
     saved, trained = load_file(checkpoint / "model.safetensors"), load_file(checkpoint / TRAINING_FILE)
@@ -76,7 +75,7 @@ def test_held_out_loss_is_logged(objects: Path, tmp_path: Path, train: Callable[
     held_out = ("dataset.eval_split=0.3", "eval_steps=2", "max_eval_samples=20")
     words = ("policy=memobench_mem", *SEEN["objects"], f"dataset={objects}", *held_out)
     train(*words, f"output_dir={tmp_path / 'run'}", "steps=4", "policy.ema_decay=0.5")
-    found = [row for row in read_losses(tmp_path / "run" / LOSSES) if row[1:3] == ("eval", "eval_loss")]
+    found = [row for row in read_losses(tmp_path / "run") if row[1:3] == ("eval", "eval_loss")]
     assert [row[0] for row in found] == [2, 4]
     assert all(0 < row[3] < 100 for row in found)
 
@@ -117,5 +116,5 @@ def test_adapters_are_trained_on_a_checkpoint(
 def test_alignments_log_their_loss(align: str, objects: Path, tmp_path: Path, train: Callable[..., None]) -> None:
     words = ("policy=memobench_mem", *SEEN["objects"], f"align={align}", f"dataset={objects}", "log_freq=1")
     train(*words, f"output_dir={tmp_path / 'run'}", "steps=1")
-    names = {row[2] for row in read_losses(tmp_path / "run" / LOSSES)}
+    names = {row[2] for row in read_losses(tmp_path / "run")}
     assert {"action_loss", "align_loss", "align_grad_norm", "align_top1"} <= names

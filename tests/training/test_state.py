@@ -1,4 +1,4 @@
-"""Step, optimizer and schedule of a checkpoint: LeRobot's files, which LeRobot reads; a log without W&B."""
+"""State of a training in its checkpoint: step, optimizer, schedule, weight average; a log without W&B."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
+import pytest
 import torch
 from accelerate import Accelerator
+from lerobot.configs.default import WandBConfig
 from lerobot.optim import load_optimizer_state, load_scheduler_state
 from lerobot.utils.random_utils import load_rng_state
+from safetensors import safe_open
 from torch import nn, optim
 
-from lerobot_memobench.training.log import LOSSES, TrainingLog, read_losses
-from lerobot_memobench.training.state import load_state, save_state
+from lerobot_memobench.training.average import TRAINING_FILE, WeightAverage
+from lerobot_memobench.training.loop import TrainingLog, load_state, save_state
+from tests.training.conftest import read_losses
 
 
 def made(updates: int) -> tuple[optim.Optimizer, Any]:
@@ -52,7 +56,7 @@ def test_state_is_restored_and_lerobot_reads_it(tmp_path: Path) -> None:
 
 
 def test_log_needs_no_wandb(tmp_path: Path) -> None:
-    config = SimpleNamespace(output_dir=tmp_path, batch_size=4, steps=2)
+    config = SimpleNamespace(output_dir=tmp_path, batch_size=4, steps=2, wandb=WandBConfig())
     dataset = SimpleNamespace(num_frames=40, num_episodes=2)
     log = TrainingLog(cast(Any, config), cast(Any, dataset), Accelerator(cpu=True), 0)
     log.note({"loss": 1.5, "grad_norm": 1.0, "lr": 0.1, "update_s": 0.01})
@@ -60,5 +64,46 @@ def test_log_needs_no_wandb(tmp_path: Path) -> None:
     log.write_evaluation(1, {"overall": {"avg_sum_reward": 0.0, "pc_success": 50.0, "eval_s": 1.0}})
     log.keep_model(tmp_path)
     log.close()
-    found = {row[2]: row[3] for row in read_losses(tmp_path / LOSSES)}
+    found = {row[2]: row[3] for row in read_losses(tmp_path)}
     assert (found["loss"], found["pc_success"]) == (1.5, 50.0)
+
+
+def test_average_follows_its_formula() -> None:
+    weight = nn.Parameter(torch.tensor([0.0]))
+    average, expected = WeightAverage({"w": weight}, 0.9), 0.0
+    for update in range(200):
+        weight.data += 1.0
+        average.update()
+        decay = min(0.9, (1 + update) / (10 + update))
+        expected = decay * expected + (1 - decay) * weight.item()
+        assert average.average["w"].item() == pytest.approx(expected)
+    with average.applied():
+        assert weight.item() == pytest.approx(expected)
+    assert weight.item() == 200
+
+
+def test_bfloat16_weights_have_a_saved_float32_average(tmp_path: Path) -> None:
+    weight = nn.Parameter(torch.tensor([1.0], dtype=torch.bfloat16))
+    average = WeightAverage({"w": weight}, 0.999)
+    average.update()
+    assert average.average["w"].dtype == torch.float32
+    average.save(tmp_path)
+    with safe_open(tmp_path / TRAINING_FILE, framework="pt") as file:
+        assert set(file.keys()) == {"weights.w", "average.w"}
+    again = WeightAverage({"w": nn.Parameter(torch.zeros(1, dtype=torch.bfloat16))}, 0.999)
+    assert again.restore(tmp_path / TRAINING_FILE, {"w"}) == []
+    assert again.counts == {"w": 1}
+    assert torch.equal(again.parameters["w"].data, weight.data)
+
+
+def test_average_of_a_new_part_starts_at_its_weights(tmp_path: Path) -> None:
+    old = WeightAverage({"a": nn.Parameter(torch.ones(1))}, 0.9)
+    old.update()
+    old.save(tmp_path)
+    new = WeightAverage({"a": nn.Parameter(torch.zeros(1)), "b": nn.Parameter(torch.full((1,), 3.0))}, 0.9)
+    assert new.restore(tmp_path / TRAINING_FILE, {"a", "b"}) == ["b"]
+    assert (new.counts, new.average["b"].item()) == ({"a": 1, "b": 0}, 3.0)
+    new.save(tmp_path)
+    again = WeightAverage(new.parameters, 0.9)
+    again.restore(tmp_path / TRAINING_FILE, {"a", "b"})
+    assert again.counts == {"a": 1, "b": 0}

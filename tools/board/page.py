@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
-from lerobot_memobench.envs.episode_log import INPUTS
+from lerobot_memobench.envs.evaluation_file import INPUTS
 from lerobot_memobench.evaluation.comparison import Contrast, compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, stand_ins_of

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, LOG, About, Evaluation, row_name
-from lerobot_memobench.envs.episode_log import EpisodeRecord, key_of
+from lerobot_memobench.envs.episode_log import EpisodeRecord, joined, key_of
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Malformed, checked, in_words, parsed
@@ -77,7 +77,8 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Submitted:
     card = read_evaluation(folder / CARD, whole=True)
     content = _unpacked(folder / LOG)
     json.loads((folder / CARD).read_bytes(), object_pairs_hook=_once)
-    return Submitted(folder, card, list(_records(folder / LOG, content)), hashlib.sha256(content).hexdigest())
+    records = joined(folder, card, _lines(folder / LOG, content))
+    return Submitted(folder, card, records, hashlib.sha256(content).hexdigest())
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -125,7 +126,7 @@ def _unpacked(file: Path) -> bytes:
     return content
 
 
-def _records(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
+def _lines(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
     known = set()
     for number, line in enumerate(content.splitlines(), start=1):
         try:

@@ -20,7 +20,7 @@ def make_env(
             by commas. None: all thirty tasks.
     """
     try:
-        from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+        from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
             "MEMOBench needs its simulator: pip install lerobot_policy_memobench", name=error.name

@@ -9,7 +9,6 @@ from __future__ import annotations
 import datetime as dt
 import gzip
 import io
-import json
 import re
 import shutil
 import unicodedata
@@ -21,13 +20,18 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, POLICY, read_log, with_omitted
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.envs.episode_log import MERGED_FILE, joined, log_text, read_lines
+from lerobot_memobench.envs.evaluation_file import (
+    EVALUATION_FILE,
+    POLICY,
+    has_evaluation,
+    read_evaluation,
+    write_evaluation,
+)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, requested_lines
+from lerobot_memobench.evaluation.records import Run, requested
 from lerobot_memobench.evaluation.report import evaluation_markdown
 from lerobot_memobench.io import PACKED, refuse_links, write_file
-from lerobot_memobench.run.card import write_card
 
 CARD, LOG = EVALUATION_FILE, MERGED_FILE + PACKED
 CONTROLS = (PAUSES,) = ("pauses",)
@@ -129,7 +133,7 @@ class Evaluation:
     Attributes:
         place: folder, as messages name it.
         card: content of its ``evaluation.json``.
-        records: lines of its log.
+        records: its episodes, see `episode_log.joined`.
     """
 
     place: Path
@@ -138,8 +142,9 @@ class Evaluation:
 
     @property
     def protocol(self) -> dict[str, Any]:
-        """The protocol of the card, with the values that earlier cards omit."""
-        return with_omitted(self.card["protocol"])
+        """The protocol of the card."""
+        found: dict[str, Any] = self.card["protocol"]
+        return found
 
     @property
     def run(self) -> Run:
@@ -154,7 +159,7 @@ def own_evaluation(folder: Path) -> Evaluation:
         MemobenchError: it lacks its card, or a line of its log contradicts the card.
     """
     card = read_evaluation(folder, whole=True)
-    return Evaluation(folder, card, requested_lines(folder, read_log(folder)))
+    return Evaluation(folder, card, requested(card, joined(folder, card, read_lines(folder))))
 
 
 # --- writing ---
@@ -170,21 +175,19 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
     Raises:
         MemobenchError: an evaluation lacks its card or its log, or the folder holds something else.
     """
-    if folder.exists() and ABOUT not in read_evaluation(folder):
+    if folder.exists() and not (has_evaluation(folder) and ABOUT in read_evaluation(folder)):
         raise MemobenchError(f"{folder} exists and holds no submission; choose another --out or --name")
     refuse_links(*(folder / control for control in CONTROLS))
     for control in {*CONTROLS} - {*evaluations}:
         shutil.rmtree(folder / control, ignore_errors=True)
     for control, source in evaluations.items():
         place = folder / control
-        place.mkdir(parents=True, exist_ok=True)
         evaluation = own_evaluation(source)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
-        write_card(place, {**evaluation.card, **block})
-        lines = [json.dumps(record) + "\n" for record in evaluation.records]
+        write_evaluation(place, {**evaluation.card, **block})
         packed = io.BytesIO()
         with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
-            file.write("".join(lines).encode())
+            file.write(log_text(evaluation.records).encode())
         write_file(place / LOG, packed.getvalue())
     return folder
 

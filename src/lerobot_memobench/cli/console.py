@@ -5,24 +5,24 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from enum import StrEnum
 from functools import partial
 from http.client import HTTPException
-from typing import Annotated
+from typing import Annotated, Any, Literal
 from urllib.error import URLError
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
 from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
 from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
 from lerobot_memobench.jobs.start import prepare_process, reader_has_left
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT
+from lerobot_memobench.tasks.task import LiberoSuite, Suite
 
 USAGE_ERROR = 2
 
@@ -36,28 +36,16 @@ WIDTH_OF_A_FILE = 140
 SPEED_PERIOD = 600.0
 
 
-class Suite(StrEnum):
-    """The suite: one set of tasks."""
-
-    PUBLISHED = PUBLISHED
-    STRICT = STRICT
-    LIBERO_SPATIAL = "libero_spatial"
-    LIBERO_OBJECT = "libero_object"
-    LIBERO_GOAL = "libero_goal"
-    LIBERO_10 = "libero_10"
-    LIBERO_90 = "libero_90"
-
-
-WhichSuite = Annotated[
-    Suite,
+AnySuite = Literal[Suite, LiberoSuite]
+SuiteOption = Annotated[
+    AnySuite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
         "picture shows; libero_…: LIBERO's own."
     ),
 ]
-OfSuite = Annotated[
-    Suite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")
-]
+Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
+AsJson = typer.Option("--json", help="Print JSON.")
 
 
 def console() -> Console:
@@ -66,6 +54,14 @@ def console() -> Console:
     It prints brackets as they are, since texts come from files.
     """
     return Console(width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE, highlight=False, markup=False)
+
+
+def table(*columns: str, right: Collection[str] = (), **settings: Any) -> Table:
+    """Return a table without rows; columns of numbers are set flush ``right``."""
+    found = Table(header_style="bold", pad_edge=False, title_justify="left", **settings)
+    for name in columns:
+        found.add_column(name, justify="right" if name in right else "left", overflow="fold")
+    return found
 
 
 def say(text: object) -> None:
@@ -78,6 +74,20 @@ def note(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def as_path(word: str) -> str:
+    """Return a word of a command line with a path that every library recognises.
+
+    A leading ``~/`` is expanded, which shells do not do in quotes or, some of them, after ``key=``. An existing path
+    with a colon becomes absolute, because Arrow and FFmpeg read ``run: 2`` as an address.
+    """
+    start, path = word.split("=", 1) if "=" in word else ("", word)
+    if path.startswith("~/"):
+        path = os.path.expanduser(path)
+    elif ":" in path and os.path.exists(path):
+        path = os.path.abspath(path)
+    return f"{start}={path}" if "=" in word else path
+
+
 class Count:
     """Progress of a run: a bar on a terminal, a line for each piece of work in a file, both with the time left."""
 
@@ -88,8 +98,7 @@ class Count:
         """Show that ``done`` of ``total`` pieces of work are done.
 
         Args:
-            what: name of the newest piece; "" prints no line.
-            trouble: its failure, printed on a terminal as well.
+            what: name of the newest piece; "" prints no line. trouble: its failure, printed on a terminal as well.
             found: pieces that an earlier run has done; they are left out of the speed.
         """
         if done <= found:
@@ -178,28 +187,29 @@ def one_sentence(error: BaseException) -> str | None:
             return _line(found)
     from draccus.utils import ParsingError
 
-    if isinstance(errors[0], ParsingError):
+    if isinstance(error, ParsingError):
         # draccus hides the message of a configuration's own check behind "couldn't instantiate".
-        return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), errors[0]))
-    if isinstance(errors[0], ImportError) and "required but not installed" in str(errors[0]):
-        return _line(errors[0])  # LeRobot's own words for a missing extra
-    if isinstance(errors[0], FileExistsError):
-        return _line(errors[0])
+        return _line(next((e for e in reversed(errors) if isinstance(e, ValueError | TypeError)), error))
+    extra = isinstance(error, ImportError) and "required but not installed" in str(error)  # of LeRobot
+    if extra or isinstance(error, FileExistsError):
+        return _line(error)
     if refusal := lock_refusal(error):
         return refusal
-    refusal = disk_refusal(error)
-    if refusal is not None:
+    if refusal := disk_refusal(error):
         named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
         where = f"{os.fsdecode(named)} " if isinstance(named, str | bytes) else ""
         return f"{where}cannot be written ({refusal}): make room, or name another folder"
     fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
     if fetched is not None and came_through(fetched, "torch.hub"):
         return (
-            "the pretrained weights of a backbone are not on this machine and could not be fetched "
-            f"({_line(fetched)[:200]}); "
-            f"{BACKBONE}=null begins with random ones; a checkpoint replaces them in either case"
+            f"the pretrained weights of a backbone are not on this machine and could not be fetched "
+            f"({_line(fetched)[:200]}); {BACKBONE}=null begins with random ones, which a checkpoint replaces"
         )
-    hub = next((found for found in errors if _is_hub_error(found)), None)
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+
+    of_hub = (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.TransportError)
+    hub = next((found for found in errors if isinstance(found, of_hub)), None)
     if hub is None:
         return None
     reason = f"{_address(errors)}{_line(hub)[:200]}"
@@ -212,15 +222,6 @@ def one_sentence(error: BaseException) -> str | None:
     return (
         f"a repository is not on this machine and could not be fetched from the hub ({reason}); name a folder on this "
         "machine: dataset=<folder> or policy=<folder>"
-    )
-
-
-def _is_hub_error(error: BaseException) -> bool:
-    import httpx
-    from huggingface_hub import errors as hub
-
-    return isinstance(
-        error, hub.HfHubHTTPError | hub.LocalEntryNotFoundError | hub.OfflineModeIsEnabled | httpx.TransportError
     )
 
 

@@ -3,51 +3,46 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.table import Table
 
-from lerobot_memobench.cli.console import OfSuite, Suite, WhichSuite, console, counting, say
+from lerobot_memobench.cli.console import AnySuite, SuiteOption, Workers, console, counting, say, table
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
-from lerobot_memobench.tasks.task import LIBERO_SUITES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
-    from lerobot_memobench.datasets.generation import GenerationSummary
-    from lerobot_memobench.datasets.validate import Verdict
+    from lerobot_memobench.datasets.validate import CheckResult
     from lerobot_memobench.jobs.processes import Advance
 
 
 Convention = Annotated[str, typer.Option(help="Images upright, or libero: mirrored and named as in LIBERO's data.")]
-
-
-class Referent(StrEnum):
-    """The goals of object and procedural tasks."""
-
-    FIXED = "fixed"
-    RANDOM = "random"
+RepoId = Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")]
+Finished = Annotated[Path, typer.Argument(help="Folder of a finished dataset.")]
+OfSuite = Annotated[
+    AnySuite | None, typer.Option(help="Refuse a dataset that holds tasks of another suite; any when left out.")
+]
 
 
 def generate(
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
-    suite: WhichSuite = Suite.PUBLISHED,
+    suite: SuiteOption = PUBLISHED,
     episodes: Annotated[int, typer.Option(min=1, help="Demonstrations per task.")] = 50,
     prompted_episodes: Annotated[
         int | None, typer.Option(min=1, help="Demonstrations per task that begins with a prompt, if not --episodes.")
     ] = None,
     seed_base: Annotated[int, typer.Option(help="Demonstration i uses the seed seed_base + i.")] = 10_000,
     referent: Annotated[
-        Referent, typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
-    ] = Referent.FIXED,
+        Literal["fixed", "random"], typer.Option(help="fixed: the catalogue's goal; random: the seed decides.")
+    ] = "fixed",
     images: Annotated[bool, typer.Option(help="Record both cameras.")] = True,
     image_size: Annotated[int, typer.Option(min=16, help="Height and width of the images, pixels.")] = 256,
     demonstration_prompt: Annotated[bool, typer.Option(help="Begin with the prompt where a task has one.")] = True,
@@ -55,8 +50,8 @@ def generate(
         bool, typer.Option("--perturb", help="Disturb the arm at random; actions are the expert's corrections.")
     ] = False,
     convention: Convention = UPRIGHT,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    workers: Workers = 1,
+    repo_id: RepoId = None,
     finish: Annotated[
         bool, typer.Option("--finish", help="Make the dataset of an unfinished run's episodes, and no other episode.")
     ] = False,
@@ -69,8 +64,8 @@ def generate(
         )
     named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
-    from lerobot_memobench.datasets.generation import episodes_of
-    from lerobot_memobench.datasets.generation import generate as run
+    from lerobot_memobench.datasets.generate import episodes_of
+    from lerobot_memobench.datasets.generate import generate as run
 
     screen = console()
     total = sum(episodes_of(task, episodes, prompted_episodes) for task in chosen)
@@ -86,7 +81,7 @@ def generate(
             out,
             prompted_episodes=prompted_episodes,
             seed_base=seed_base,
-            referent=referent.value,
+            referent=referent,
             images=images,
             image_size=image_size,
             demonstration_prompt=demonstration_prompt,
@@ -98,30 +93,18 @@ def generate(
             notify=partial(screen.print, soft_wrap=True),
             **named,
         )
-    _print_summary(summary)
-    return summary.exit_status
-
-
-def _print_summary(summary: GenerationSummary) -> None:
-    """Print the outcome of every seed and the place of the dataset."""
-    console().print(Unbroken(_summary_table(summary)), crop=False)
-    for failure in summary.failures:
-        say(f"no demonstration of {failure.task_name}, seed {failure.seed}: {failure.reason}")
-    if summary.folder is None:
-        say("no dataset was written: no seed was solved")
-    else:
-        say(f"dataset: {summary.folder}")
-
-
-def _summary_table(summary: GenerationSummary) -> Table:
-    table = Table(header_style="bold", pad_edge=False)
-    table.add_column("task")
-    for name in ("solved", "of", "frames", "mean length"):
-        table.add_column(name, justify="right")
-    for task in summary.tasks:
-        mean = f"{sum(task.frames) / len(task.frames):.0f}" if task.frames else "–"
-        table.add_row(task.name, str(task.solved), str(task.episodes), str(sum(task.frames)), mean)
-    return table
+    rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
+    for name in summary.tasks:
+        of_task = [episode for episode in summary.episodes if episode.task_name == name]
+        frames = [episode.frames for episode in of_task if episode.failure is None]
+        mean = f"{sum(frames) / len(frames):.0f}" if frames else "–"
+        rows.add_row(name, str(len(frames)), str(len(of_task)), str(sum(frames)), mean)
+    console().print(Unbroken(rows), crop=False)
+    for episode in summary.failures:
+        say(f"no demonstration of {episode.task_name}, seed {episode.seed}: {episode.failure}")
+    written = f"dataset: {summary.folder}"
+    say("no dataset was written: no seed was solved" if summary.folder is None else written)
+    return 1 if summary.failures else 0
 
 
 def convert(
@@ -130,8 +113,8 @@ def convert(
     ],
     out: Annotated[Path, typer.Option(help="Folder of the dataset that is made.")],
     convention: Convention = UPRIGHT,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-    repo_id: Annotated[str | None, typer.Option(help="Name of the dataset, user/name.")] = None,
+    workers: Workers = 1,
+    repo_id: RepoId = None,
 ) -> int:
     """Turn HDF5 demonstrations into a LeRobotDataset.
 
@@ -158,10 +141,8 @@ def convert(
         say(f"left out: {problem}")
     for note in summary.notes:
         say(f"note: {note}")
-    if summary.folder is None:
-        say("no dataset was written: no demonstration could be used")
-    else:
-        say(f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}")
+    written = f"dataset of {count_of(summary.episodes, 'episode')}: {summary.folder}"
+    say("no dataset was written: no demonstration could be used" if summary.folder is None else written)
     return summary.exit_status
 
 
@@ -230,70 +211,69 @@ def view(
     ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
-    from lerobot_memobench.datasets.lerobot_format.tables import read_info
-    from lerobot_memobench.training.view import choice_for, write_view
+    from lerobot_memobench.datasets.episodes import read_info
+    from lerobot_memobench.training.view import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
     if convention is not None:
         check_choice("convention", convention, [*CONVENTIONS])
-    choice = choice_for(None, read_info(dataset)["features"], prompts, obs_type)
-    write_view(dataset, out, replace(choice, convention=convention))
+    options = view_options(None, read_info(dataset)["features"], prompts, obs_type)
+    write_view(dataset, out, replace(options, convention=convention))
     say(f"view: {out}")
 
 
 def validate(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    folder: Finished,
+    workers: Workers = 1,
     suite: OfSuite = None,
 ) -> int:
     """Replay every episode and read every file to its end.
 
     The first disagreement of each is reported, and files that were written again.
     """
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
-    from lerobot_memobench.datasets.validate import exit_status
+    from lerobot_memobench.datasets.episodes import check_suite_of
     from lerobot_memobench.datasets.validate import validate as run
 
     if suite is not None:
         check_suite_of(folder, suite)
     with counting(console(), "episodes") as count:
 
-        def advance(done: int, total: int, verdict: Verdict) -> None:
-            count(done, total, verdict.subject, trouble=verdict.disagreement)
+        def advance(done: int, total: int, result: CheckResult) -> None:
+            count(done, total, result.subject, trouble=result.disagreement)
 
-        verdicts = run(folder, workers=workers, progress=advance)
-    for verdict in verdicts:
-        if verdict.note is not None:
-            say(f"note: {verdict.subject}: {verdict.note}")
-    episodes, files = ([each for each in verdicts if each.of_file == of_file] for of_file in (False, True))
-    agree, damaged = (sum(each.disagreement is None for each in episodes), exit_status(files))
-    say(f"{agree} of {len(episodes)} episodes agree" + damaged * ", and files of the dataset do not (above)")
-    return exit_status(verdicts)
+        results = run(folder, workers=workers, progress=advance)
+    for result in results:
+        if result.note is not None:
+            say(f"note: {result.subject}: {result.note}")
+    episodes, files = ([each.disagreement for each in results if each.of_file == of_file] for of_file in (False, True))
+    damaged = ", and files of the dataset do not (above)" if any(files) else ""
+    say(f"{episodes.count(None)} of {len(episodes)} episodes agree{damaged}")
+    return 1 if any(episodes) or any(files) else 0
 
 
 def push(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    folder: Finished,
     repo_id: Annotated[str, typer.Option(help="Where to, user/name on the Hugging Face hub.")],
     private: Annotated[bool | None, typer.Option(help="Whether a repository that has to be made is private.")] = None,
 ) -> int:
     """Upload a dataset to the Hugging Face hub. The token is that of `hf auth login` or HF_TOKEN. The same command
     continues a broken upload. Files of an earlier dataset there are deleted.
     """
-    from lerobot_memobench.datasets.publish import push as run
+    from lerobot_memobench.datasets.card import push as run
 
     say(f"dataset: {run(folder, repo_id, private=private, notify=say)}")
     return 0
 
 
 def describe(
-    folder: Annotated[Path, typer.Argument(help="Folder of a finished dataset.")],
+    folder: Finished,
     out: Annotated[Path | None, typer.Option(help="Where to; DATASET/description when left out.")] = None,
     suite: OfSuite = None,
 ) -> int:
     """Summarise a dataset. The card's tables and the hash of every episode, small enough to commit."""
-    from lerobot_memobench.datasets.lerobot_format.reading import check_suite_of
-    from lerobot_memobench.datasets.publish import describe as run
+    from lerobot_memobench.datasets.card import describe as run
+    from lerobot_memobench.datasets.episodes import check_suite_of
 
     if suite is not None:
         check_suite_of(folder, suite)

@@ -11,7 +11,7 @@ import shlex
 import sys
 import textwrap
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import Field, fields
 from datetime import datetime
@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from lerobot_memobench.cli.console import WITH_PARENT, console, counting, note, run_command, say
+from lerobot_memobench.cli.console import WITH_PARENT, as_path, console, counting, note, run_command, say
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import as_path, explaining_disk_errors
+from lerobot_memobench.io import explaining_disk_errors
 from lerobot_memobench.jobs.processes import adding_resume_hint
 from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.run.command_line import (
@@ -65,7 +65,7 @@ def run(line: Sequence[str]) -> int:
     """Run the command line."""
     commands = lerobot_commands()
     if not line or line[0] in ("-h", "--help", "help"):
-        print(overview(commands))
+        print(help_text("").replace("{commands}", ", ".join(sorted(commands))), end="")
         return 0
     name = line[0]
     if name not in commands:
@@ -84,9 +84,9 @@ def run(line: Sequence[str]) -> int:
         raise MemobenchError("found python -OO or PYTHONOPTIMIZE=2, and transformers reads docstrings; use -O or 1")
     check_names(name, words)
     if name == "train":
-        from lerobot_memobench.training.command import train
+        from lerobot_memobench.training.command import run_training
 
-        return train(words, note)
+        return run_training(words, note)
     use_threads(ACTING)  # before torch is imported
     if is_of_benchmark(words) and HELP not in words:
         return evaluate(words)
@@ -95,8 +95,12 @@ def run(line: Sequence[str]) -> int:
 
 def help_of(command: str) -> str:
     """Return the help of ``lerobot eval`` or ``lerobot train``, with the settings of the environment."""
-    text = Path(__file__).with_name(f"lerobot_{command}.txt").read_text(encoding="utf-8")
-    return text.replace("{environment}", "".join(map(explained, fields(EnvSettings))))
+    return help_text(f"_{command}").replace("{environment}", "".join(map(explained, fields(EnvSettings))))
+
+
+def help_text(command: str) -> str:
+    """Return the text of a help file."""
+    return Path(__file__).with_name(f"lerobot{command}.txt").read_text(encoding="utf-8")
 
 
 def explained(setting: Field[Any]) -> str:
@@ -107,25 +111,6 @@ def explained(setting: Field[Any]) -> str:
     accepted = f"; {', '.join(values)}" if values else ""
     text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)
     return f"  {setting.name}=\n{textwrap.indent(text, ' ' * 8)}\n"
-
-
-def overview(commands: Iterable[str]) -> str:
-    """Return the help of ``lerobot`` itself."""
-    return "\n".join(
-        [
-            "usage: lerobot <command> key=value … [--flag=value …]",
-            "",
-            "  lerobot eval env=memobench                                   the scripted expert on all tasks",
-            "  lerobot eval env=memobench policy=<checkpoint> tasks=object  a trained policy",
-            "  lerobot train policy=memobench_mem align=contrastive dataset=<folder>",
-            "  lerobot train config=train_paper dataset=<folder>            the paper's recipe (memobench recipe)",
-            "",
-            "`lerobot eval --help` and `lerobot train --help` explain these short forms. Every other setting has its",
-            "full name (policy.optimizer_lr=1e-4), as listed there.",
-            "",
-            "commands: " + ", ".join(sorted(commands)),
-        ]
-    )
 
 
 # --- eval ---

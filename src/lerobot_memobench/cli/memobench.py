@@ -16,17 +16,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from lerobot_memobench.cli import data
-from lerobot_memobench.cli.board import export, submit
-from lerobot_memobench.cli.console import Suite, WhichSuite, console, note, run_app, say
+from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console, note, run_app, say, table
 from lerobot_memobench.cli.data import cache, generate
-from lerobot_memobench.cli.report import compare, merge, report, rerun
+from lerobot_memobench.cli.report import compare, export, merge, report, rerun, submit
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
-from lerobot_memobench.io import as_path, count_of, in_words
+from lerobot_memobench.io import count_of, in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.tasks.catalogue import (
@@ -43,6 +41,8 @@ from lerobot_memobench.tasks.gap import longest_gap
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED, Task
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from lerobot_memobench.doctor import Finding
 
 COLOURS = {
@@ -57,14 +57,21 @@ COLOURS = {
 
 def tasks(
     as_json: Annotated[bool, typer.Option("--json", help="Print everything about each task as JSON.")] = False,
-    suite: WhichSuite = Suite.PUBLISHED,
+    suite: SuiteOption = PUBLISHED,
     folder: Annotated[
         Path | None,
         typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
-    found, problems = load_tasks(folder, suite)
+    found, problems = list[Task](), list[str]()
+    for place in [task_folder(name) for name in task_names(suite=suite)] if folder is None else find_tasks(folder):
+        try:
+            found.append(get_task(place.name) if folder is None else load_task(place))
+        except MemobenchError as error:
+            problems.append(str(error))
+    if not found:
+        raise MemobenchError(problems[0])
     if as_json:
         from lerobot_memobench.sim.simulation import Simulation
 
@@ -82,58 +89,33 @@ def tasks(
     return 1 if problems else 0
 
 
-def load_tasks(folder: Path | None, suite: str = PUBLISHED) -> tuple[list[Task], list[str]]:
-    """Return the tasks of a suite, or those below a folder with the errors of those that cannot be loaded.
-
-    Raises:
-        MemobenchError: there is no task, or none can be loaded.
-    """
-    if folder is None:
-        return [get_task(name) for name in task_names(suite=suite)], []
-    found, problems = [], []
-    for place in find_tasks(folder):
-        try:
-            found.append(load_task(place))
-        except MemobenchError as error:
-            problems.append(str(error))
-    if not found:
-        raise MemobenchError(problems[0])
-    return found, problems
-
-
 def task_table(found: Sequence[Task]) -> Table:
     """Return one row per task; ``tasks=`` and ``--tasks`` take the numbers, a user's own tasks have none.
 
     ``gap``: the longest of the task's checkpoints, control steps.
     """
-    suites = {task.suite if _is_known(task) else "" for task in found}
+    known = [suite_of(task.name) is not None and task.folder == task_folder(task.name) for task in found]
+    suites = {task.suite if own else "" for task, own in zip(found, known, strict=True)}
     title = count_of(len(found), "task") + (f" of the {min(suites)} suite" if len(suites) == 1 and all(suites) else "")
-    table = Table(title=title, title_justify="left", header_style="bold", pad_edge=False)
     if suites <= {*LIBERO_SUITES}:  # without checkpoints and prompts
-        for name in ("id", "task", "instruction"):
-            table.add_column(name, justify="right" if name == "id" else "left")
+        rows = table("id", "task", "instruction", right=("id",), title=title)
         for task in found:
-            table.add_row(str(task_number(task.name)), task.name, task.language)
-        return table
-    for name in ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction"):
-        table.add_column(name, justify="right" if name in ("no.", "gap") else "left")
+            rows.add_row(str(task_number(task.name)), task.name, task.language)
+        return rows
+    columns = ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction")
+    rows = table(*columns, right=("no.", "gap"), title=title)
     for k, task in enumerate(found):
         if k and task.memory_type != found[k - 1].memory_type:
-            table.add_section()
+            rows.add_section()
         prompt = task.prompt.kind if task.prompt else ""
         gap = str(longest_gap(task) or "")
-        number = str(task_number(task.name)) if _is_known(task) else ""
-        table.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
-    return table
-
-
-def _is_known(task: Task) -> bool:
-    """Return whether a task is of the catalogue, not of a user's folder."""
-    return suite_of(task.name) is not None and task.folder == task_folder(task.name)
+        number = str(task_number(task.name)) if known[k] else ""
+        rows.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
+    return rows
 
 
 def objects(
-    as_json: Annotated[bool, typer.Option("--json", help="Print slots, fields and classes as JSON.")] = False,
+    as_json: Annotated[bool, AsJson] = False,
 ) -> None:
     """Print the layout of object observations. Slots, the fields of each, the classes by index."""
     from lerobot_memobench.sim.object_layout import SLOTS
@@ -150,7 +132,7 @@ def objects(
 
 
 def doctor(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+    as_json: Annotated[bool, AsJson] = False,
 ) -> int:
     """Check that this machine can run the benchmark. Each problem comes with its fix."""
     from dataclasses import asdict
@@ -167,15 +149,13 @@ def doctor(
 
 def finding_table(findings: Sequence[Finding]) -> Table:
     """Return one row per finding, with the fix below the problem."""
-    table = Table(header_style="bold", pad_edge=False, show_lines=False)
-    for name in ("checked", "", "found"):
-        table.add_column(name, overflow="fold")
+    rows = table("checked", "", "found")
     for finding in findings:
         found = Text(finding.detail)
         if finding.fix:
             found.append("\nfix: ", "bold").append(finding.fix)
-        table.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), found)
-    return table
+        rows.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), found)
+    return rows
 
 
 def assets(
@@ -186,13 +166,12 @@ def assets(
     """Find LIBERO's assets, of which the scenes are made. They are downloaded from the Hugging Face hub if this machine
     has no complete copy.
     """
-    from lerobot_memobench.sim.libero import fetch
-    from lerobot_memobench.sim.libero.files import ASSETS_VARIABLE, TERMS
+    from lerobot_memobench.sim.files import ASSETS_VARIABLE, TERMS, copy_to, obtain
 
-    place = fetch.obtain()
+    place = obtain()
     say(f"LIBERO's assets: {place.folder}, from {place.source}. {TERMS}.")
     if to is not None:
-        say(f"copied {in_words(fetch.copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
+        say(f"copied {in_words(copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
 
 
 # --- train ---
@@ -207,12 +186,10 @@ def recipe(
     if name is not None:
         print(recipe_file(name))
         return 0
-    table = Table(header_style="bold", pad_edge=False)
-    table.add_column("recipe", no_wrap=True)
-    table.add_column("trains")
+    rows = table("recipe", "trains")
     for key, path in recipes().items():
-        table.add_row(key, path.read_text().splitlines()[0].removeprefix("# "))
-    console().print(table)
+        rows.add_row(key, path.read_text().splitlines()[0].removeprefix("# "))
+    console().print(rows)
     return 0
 
 
@@ -229,17 +206,17 @@ def conformance(
     """Check the memory of a policy. Rows are independent, reset forgets, the prompt reaches the memory, training has
     the history of a rollout, and more. Status 1 where a check fails.
     """
-    from lerobot_memobench.conformance.checks import Outcome, run_checks
+    from lerobot_memobench.conformance.checks import FAILED, run_checks
     from lerobot_memobench.conformance.subject import load_subject
 
     with tempfile.TemporaryDirectory() as folder:
         subject = load_subject(settings, Path(folder))
         results = run_checks(subject)
-    table = Table("check", "outcome", "", title=f"Conformance of {subject.name}", title_justify="left")
+    rows = table("check", "outcome", "", title=f"Conformance of {subject.name}")
     for result in results:
-        table.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
-    console().print(table)
-    failed = [result.check for result in results if result.outcome is Outcome.FAILED]
+        rows.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
+    console().print(rows)
+    failed = [result.check for result in results if result.outcome is FAILED]
     say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
     return 1 if failed else 0
 

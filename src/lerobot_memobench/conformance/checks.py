@@ -1,9 +1,9 @@
-"""Checks of a memory policy; each returns a sentence with the problem and its solution.
+"""Checks of a memory policy. A check changes the policy's observations and compares its actions: some may not change,
+others must.
 
-A check changes the policy's observations and compares its actions: some may not change, others must. The effect of a
-frame is measured by replacing it with the last one of another stream, because at home the frames of two episodes may be
-equal. If the present frame changes the action of its own call, the policy plans at that call; if a frame changes
-actions of later plans, it is remembered.
+The effect of a frame is measured by replacing it with the last one of another stream, because at home the frames of two
+episodes may be equal. If the present frame changes the action of its own call, the policy plans at that call; if a
+frame changes actions of later plans, it is remembered.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RESETS = "let reset() clear the history and the action queue of every row"
 BY_ROW = "keep a history and an action queue for each row, and begin and plan by that row's phase and step alone"
 
 
-class Outcome(StrEnum):
+class CheckOutcome(StrEnum):
     """How a check ended."""
 
     PASSED = "passed"
@@ -42,36 +42,29 @@ class Outcome(StrEnum):
     NOT_CHECKED = "not checked"
 
 
+PASSED, FAILED, NO_MEMORY, NOT_CHECKED = CheckOutcome
+
+CheckVerdict = tuple[CheckOutcome, str]
+"""An outcome and its sentence: the problem and its solution."""
+
+
 @dataclass(frozen=True)
 class Result:
     """Result of a check: its name, its outcome, and a sentence."""
 
     check: str
-    outcome: Outcome
+    outcome: CheckOutcome
     sentence: str
-
-
-class Refuted(Exception):
-    """A check failed; the message is its sentence."""
-
-
-class NotAsked(Exception):
-    """A check does not apply; the message is the reason."""
-
-    def __init__(self, sentence: str, outcome: Outcome = Outcome.NOT_CHECKED) -> None:
-        super().__init__(sentence)
-        self.outcome = outcome
 
 
 class Behaviour:
     """Actions of a policy when frames are replaced, measured once for all checks.
 
+    Raise `MemobenchError` if the policy does not act at all.
+
     Attributes:
         one, two, three: the streams. A check looks at the row of ``one``.
         alone: the actions (calls, A) of that stream in a batch of its own.
-
-    Raises:
-        MemobenchError: the policy does not act at all.
     """
 
     def __init__(self, subject: Subject) -> None:
@@ -88,9 +81,9 @@ class Behaviour:
 
     def changes(self, calls: Iterable[int], shown: Stream | None = None) -> Actions:
         """Return the change of each call's action if a stream, or the second one's last frame, is shown at calls."""
-        shown = shown or _only(self.two, len(self.two) - 1)
-        found = self.subject.roll([self.one.showing(shown, [*calls])])[:, 0]
-        return np.abs(found - self.alone).max(axis=1)
+        shown = shown or self.two.only(len(self.two) - 1)
+        actions = self.subject.roll([self.one.showing(shown, [*calls])])[:, 0]
+        return np.abs(actions - self.alone).max(axis=1)
 
     @cached_property
     def by_frame(self) -> dict[int, Actions]:
@@ -147,212 +140,198 @@ class Behaviour:
         calls = np.flatnonzero(~(np.abs(one[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
 
-    def require_memory(self) -> None:
-        """Skip a check without a memory."""
-        if not self.memory:
-            raise NotAsked("it has no memory", Outcome.NO_MEMORY)
+
+# --- the checks, in an order in which later ones rely on earlier ones ---
+
+Check = Callable[[Behaviour], CheckVerdict]
+CHECKS: dict[str, Check] = {}
 
 
-def remembers(found: Behaviour) -> str:
-    """Actions depend on frames of the past."""
-    if found.memory:
-        return f"frames of the past change actions by up to {found.memory:.2g}"
-    raise Refuted(
-        "it has no memory: no earlier frame changes a later action; this is correct for a policy without memory"
-    )
+def check(name: str, *, of_memory: bool = False) -> Callable[[Check], Check]:
+    """Add a function to the checks; one ``of_memory`` is skipped for a policy without."""
+
+    def add(function: Check) -> Check:
+        def checked(behaviour: Behaviour) -> CheckVerdict:
+            return (NO_MEMORY, "it has no memory") if of_memory and not behaviour.memory else function(behaviour)
+
+        CHECKS[name] = checked
+        return function
+
+    return add
 
 
-def reads_the_prompt(found: Behaviour) -> str:
-    """Actions of the execution depend on the frames of the prompt."""
-    found.require_memory()
-    if not found.subject.reads_prompt:
-        raise Refuted(
-            "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
-            "True on the class of its configuration"
-        )
-    if not found.one.start:
-        raise NotAsked("no episode of the dataset has a prompt; name one with prompts, or none")
-    if not found.prompt:
-        raise Refuted(
-            "another prompt changes no action: remember frames while observation.phase is 0, and keep them when it "
-            "becomes 1"
-        )
-    return f"another prompt changes actions by up to {found.prompt:.2g}"
-
-
-def plans_after_prompt(found: Behaviour) -> str:
-    """The first execution frame is planned from."""
-    if found.one.start in found.plans:
-        return "the first execution frame decides the first action"
-    raise Refuted(
-        "the first action of the execution does not depend on its first frame, but was planned in the prompt: clear a "
-        "row's action queue when observation.phase becomes 1"
-    )
-
-
-def remembers_every_step(found: Behaviour) -> str:
-    """Frames between two plans are remembered as well.
-
-    Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
-    """
-    found.require_memory()
+def run_check(name: str, behaviour: Behaviour) -> Result:
+    """Run one check."""
     try:
-        return _remembers_between_plans(found)
-    except Refuted as refusal:
-        config = found.subject.policy.config
-        for steps in INTERVALS if hasattr(config, "n_action_steps") else ():
-            # A policy may refuse an interval, such as one longer than its chunks.
-            with found.subject.planning_every(steps), contextlib.suppress(Exception):
-                return _remembers_between_plans(Behaviour(found.subject))
-        raise refusal
+        return Result(name, *CHECKS[name](behaviour))
+    except Exception as error:  # any policy may raise anything
+        return Result(name, FAILED, f"the policy raised {type(error).__name__}: {error}")
 
 
-def _remembers_between_plans(found: Behaviour) -> str:
-    between = [frame for frame in found.by_frame if frame not in found.plans]
-    if not between:
-        return "it plans at every control step"
-    if any(found.later(frame) for frame in between):
-        return "frames between two plans change later ones"
-    if any(found.later(frame) for frame in found.plans):
-        raise Refuted(
-            "frames at which it plans are remembered, those between two plans are not, so its history depends on "
-            "n_action_steps: remember the frame at every call of select_action, also while actions are queued"
-        )
-    raise NotAsked(
-        f"none of {len(found.one) - found.one.start} execution frames changes a later plan: it remembers the prompt "
-        "alone, or has a long stride; set a smaller one, for example policy.memory_stride=2"
-    )
+def run_checks(subject: Subject) -> list[Result]:
+    """Run all checks in their order."""
+    behaviour = Behaviour(subject)
+    return [run_check(name, behaviour) for name in CHECKS]
 
 
-def rows_are_independent(found: Behaviour) -> str:
-    """A row's actions do not depend on the other rows of the batch, which begin at other steps."""
-    roll, one = found.subject.roll, found.one
-    between = roll([found.two, one, found.three])[:, 1]
-    others = roll([found.three, one, found.two])[:, 1]
-    for other, batch in ((others, "with other rows in its batch"), (found.alone, "alone in its batch")):
-        call = found.differ(between, other)
-        if call is not None:
-            raise Refuted(f"at call {call} a row acts differently {batch}: {BY_ROW}")
-    return "a row acts alike alone and with other rows"
-
-
-def frozen_rows_are_left_alone(found: Behaviour) -> str:
-    """A finished row, which repeats its last frame, does not change the other rows."""
-    over = found.two.until(found.two.start + 4)
-    call = found.differ(found.subject.roll([over, found.one])[:, 1], found.after_two)
-    if call is not None:
-        raise Refuted(
-            f"at call {call} a row acts differently in a batch with a finished row, which repeats its frame: {BY_ROW}"
-        )
-    return "finished rows change no other row"
-
-
-def reset_forgets(found: Behaviour) -> str:
-    """An episode does not depend on the one before it."""
-    before = []
-    for stream in (found.two.until(found.two.start + 4), found.three):
-        found.subject.roll([stream])
-        before.append(found.subject.roll([found.one])[:, 0])
-    call = found.differ(*before)
-    if call is not None:
-        raise Refuted(f"at call {call} it acts differently after another episode: {RESETS}")
-    found.subject.roll([found.three, found.two])
-    call = found.differ(before[0], found.subject.roll([found.one])[:, 0])
-    if call is not None:
-        raise Refuted(f"at call {call} it acts differently after a batch of more rows: {RESETS}")
-    return "an episode is the same after any other"
-
-
-def same_history_in_training(found: Behaviour) -> str:
-    """The first action for a training sample equals the action that a rollout plans at its frame."""
-    plans = sorted({*found.plans, *found.all_plans[-COMPARED:]})  # a hold may have thousands
-    if not plans:
-        raise NotAsked("no frame changes the action of its own call, so the beginning of a chunk is unknown")
-    try:
-        predicted = found.subject.predict(found.one, plans)
-    except Exception as error:
-        reason = str(error).splitlines()[0][:80] if str(error) else ""
-        raise NotAsked(
-            f"predict_action_chunk does not accept a training batch ({type(error).__name__}: {reason}); let it read "
-            "the history in the batch, as forward does"
-        ) from None
-    acted = found.alone[plans]
-    call = found.differ(predicted, acted)
-    if call is None:
-        return f"{len(plans)} training samples have the actions of the rollout"
-    present = np.stack([found.subject.roll([_only(found.one, plan)])[0, 0] for plan in plans])
-    if found.memory and found.differ(predicted, present) is None:
-        raise NotAsked(
-            "predict_action_chunk reads only the present frames of a training batch; let it read the history in the "
-            "batch, as forward does"
-        )
-    raise Refuted(
-        f"for frame {plans[call]} the action of a training sample differs from the rollout's: compare the frames of "
-        "the history, the padding at the start of the episode, and the normalisation"
-    )
-
-
-def _only(stream: Stream, call: int) -> Stream:
-    return Stream(stream.frames[call : call + 1], stream.task, stream.indices[call : call + 1])
-
-
-def is_deterministic(found: Behaviour) -> str:
-    """The same seed gives the same actions."""
+@check("deterministic given a seed")
+def _is_deterministic(behaviour: Behaviour) -> CheckVerdict:
     from lerobot.utils.random_utils import set_seed
 
     rolled = []
     for _ in range(2):
         set_seed(1)
-        rolled.append(found.subject.roll([found.one], equal_noise=False)[:, 0])
-    call = found.differ(*rolled)
+        rolled.append(behaviour.subject.roll([behaviour.one], equal_noise=False)[:, 0])
+    call = behaviour.differ(*rolled)
+    if call is None:
+        return PASSED, "the same seed gives the same actions"
+    return FAILED, (
+        f"at call {call} it acts differently with the same seed: draw random numbers with torch alone, and let "
+        "reset() clear all state"
+    )
+
+
+@check("reset forgets")
+def _reset_forgets(behaviour: Behaviour) -> CheckVerdict:
+    before = []
+    for stream in (behaviour.two.until(behaviour.two.start + 4), behaviour.three):
+        behaviour.subject.roll([stream])
+        before.append(behaviour.subject.roll([behaviour.one])[:, 0])
+    call = behaviour.differ(*before)
     if call is not None:
-        raise Refuted(
-            f"at call {call} it acts differently with the same seed: draw random numbers with torch alone, and let "
-            "reset() clear all state"
-        )
-    return "the same seed gives the same actions"
-
-
-def declares_needed_frames(found: Behaviour) -> str:
-    """Frames that `needs_observation` declares unnecessary are not read."""
-    call = found.differ(found.subject.roll([found.two, found.one], sparing=True)[:, 1], found.after_two)
+        return FAILED, f"at call {call} it acts differently after another episode: {RESETS}"
+    behaviour.subject.roll([behaviour.three, behaviour.two])
+    call = behaviour.differ(before[0], behaviour.subject.roll([behaviour.one])[:, 0])
     if call is not None:
-        raise Refuted(
-            f"at call {call} it acts differently without frames that needs_observation() declared unnecessary: return "
-            "True before every frame that is remembered or planned from"
+        return FAILED, f"at call {call} it acts differently after a batch of more rows: {RESETS}"
+    return PASSED, "an episode is the same after any other"
+
+
+@check("remembers")
+def _remembers(behaviour: Behaviour) -> CheckVerdict:
+    if behaviour.memory:
+        return PASSED, f"frames of the past change actions by up to {behaviour.memory:.2g}"
+    return FAILED, (
+        "it has no memory: no earlier frame changes a later action; this is correct for a policy without memory"
+    )
+
+
+@check("reads the prompt", of_memory=True)
+def _reads_the_prompt(behaviour: Behaviour) -> CheckVerdict:
+    if not behaviour.subject.reads_prompt:
+        return FAILED, (
+            "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
+            "True on the class of its configuration"
         )
-    return "unnecessary frames have no effect"
+    if not behaviour.one.start:
+        return NOT_CHECKED, "no episode of the dataset has a prompt; name one with prompts, or none"
+    if behaviour.prompt:
+        return PASSED, f"another prompt changes actions by up to {behaviour.prompt:.2g}"
+    return FAILED, (
+        "another prompt changes no action: remember frames while observation.phase is 0, and keep them when it "
+        "becomes 1"
+    )
 
 
-CHECKS: dict[str, Callable[[Behaviour], str]] = {
-    "deterministic given a seed": is_deterministic,
-    "reset forgets": reset_forgets,
-    "remembers": remembers,
-    "reads the prompt": reads_the_prompt,
-    "plans after the prompt": plans_after_prompt,
-    "remembers every control step": remembers_every_step,
-    "rows are independent": rows_are_independent,
-    "finished rows change no other": frozen_rows_are_left_alone,
-    "same history in training": same_history_in_training,
-    "needs_observation is true": declares_needed_frames,
-}
-"""Name -> check, in an order in which later checks rely on earlier ones. A check returns a sentence if it passes, and
-raises `Refuted` or `NotAsked` otherwise."""
+@check("plans after the prompt")
+def _plans_after_prompt(behaviour: Behaviour) -> CheckVerdict:
+    if behaviour.one.start in behaviour.plans:
+        return PASSED, "the first execution frame decides the first action"
+    return FAILED, (
+        "the first action of the execution does not depend on its first frame, but was planned in the prompt: clear a "
+        "row's action queue when observation.phase becomes 1"
+    )
 
 
-def run_check(name: str, found: Behaviour) -> Result:
-    """Run one check."""
+@check("remembers every control step", of_memory=True)
+def _remembers_every_step(behaviour: Behaviour) -> CheckVerdict:
+    subject, verdict = behaviour.subject, _remembers_between_plans(behaviour)
+    # Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
+    for steps in INTERVALS if verdict[0] is FAILED and hasattr(subject.policy.config, "n_action_steps") else ():
+        # A policy may refuse an interval, such as one longer than its chunks.
+        with subject.planning_every(steps), contextlib.suppress(Exception):
+            other = _remembers_between_plans(Behaviour(subject))
+            if other[0] is PASSED:
+                return other
+    return verdict
+
+
+def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
+    between = [frame for frame in behaviour.by_frame if frame not in behaviour.plans]
+    if not between:
+        return PASSED, "it plans at every control step"
+    if any(behaviour.later(frame) for frame in between):
+        return PASSED, "frames between two plans change later ones"
+    if any(behaviour.later(frame) for frame in behaviour.plans):
+        return FAILED, (
+            "frames at which it plans are remembered, those between two plans are not, so its history depends on "
+            "n_action_steps: remember the frame at every call of select_action, also while actions are queued"
+        )
+    return NOT_CHECKED, (
+        f"none of {len(behaviour.one) - behaviour.one.start} execution frames changes a later plan: it remembers the "
+        "prompt alone, or has a long stride; set a smaller one, for example policy.memory_stride=2"
+    )
+
+
+@check("rows are independent")
+def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
+    roll, one = behaviour.subject.roll, behaviour.one
+    # The other rows begin at other steps.
+    between = roll([behaviour.two, one, behaviour.three])[:, 1]
+    others = roll([behaviour.three, one, behaviour.two])[:, 1]
+    for other, batch in ((others, "with other rows in its batch"), (behaviour.alone, "alone in its batch")):
+        call = behaviour.differ(between, other)
+        if call is not None:
+            return FAILED, f"at call {call} a row acts differently {batch}: {BY_ROW}"
+    return PASSED, "a row acts alike alone and with other rows"
+
+
+@check("finished rows change no other")
+def _finished_rows_change_no_other(behaviour: Behaviour) -> CheckVerdict:
+    over = behaviour.two.until(behaviour.two.start + 4)
+    call = behaviour.differ(behaviour.subject.roll([over, behaviour.one])[:, 1], behaviour.after_two)
+    if call is None:
+        return PASSED, "finished rows change no other row"
+    return FAILED, (
+        f"at call {call} a row acts differently in a batch with a finished row, which repeats its frame: {BY_ROW}"
+    )
+
+
+@check("same history in training")
+def _same_history_in_training(behaviour: Behaviour) -> CheckVerdict:
+    plans = sorted({*behaviour.plans, *behaviour.all_plans[-COMPARED:]})  # a hold may have thousands
+    if not plans:
+        return NOT_CHECKED, "no frame changes the action of its own call, so the beginning of a chunk is unknown"
     try:
-        return Result(name, Outcome.PASSED, CHECKS[name](found))
-    except Refuted as error:
-        return Result(name, Outcome.FAILED, str(error))
-    except NotAsked as error:
-        return Result(name, error.outcome, str(error))
-    except Exception as error:  # any policy may raise anything
-        return Result(name, Outcome.FAILED, f"the policy raised {type(error).__name__}: {error}")
+        predicted = behaviour.subject.predict(behaviour.one, plans)
+    except Exception as error:
+        reason = str(error).splitlines()[0][:80] if str(error) else ""
+        return NOT_CHECKED, (
+            f"predict_action_chunk does not accept a training batch ({type(error).__name__}: {reason}); let it read "
+            "the history in the batch, as forward does"
+        )
+    call = behaviour.differ(predicted, behaviour.alone[plans])
+    if call is None:
+        return PASSED, f"{len(plans)} training samples have the actions of the rollout"
+    present = np.stack([behaviour.subject.roll([behaviour.one.only(plan)])[0, 0] for plan in plans])
+    if behaviour.memory and behaviour.differ(predicted, present) is None:
+        return NOT_CHECKED, (
+            "predict_action_chunk reads only the present frames of a training batch; let it read the history in the "
+            "batch, as forward does"
+        )
+    return FAILED, (
+        f"for frame {plans[call]} the action of a training sample differs from the rollout's: compare the frames of "
+        "the history, the padding at the start of the episode, and the normalisation"
+    )
 
 
-def run_checks(subject: Subject) -> list[Result]:
-    """Run all checks in their order."""
-    found = Behaviour(subject)
-    return [run_check(name, found) for name in CHECKS]
+@check("needs_observation is true")
+def _needs_observation_is_true(behaviour: Behaviour) -> CheckVerdict:
+    sparing = behaviour.subject.roll([behaviour.two, behaviour.one], sparing=True)[:, 1]
+    call = behaviour.differ(sparing, behaviour.after_two)
+    if call is None:
+        return PASSED, "unnecessary frames have no effect"
+    return FAILED, (
+        f"at call {call} it acts differently without frames that needs_observation() declared unnecessary: return "
+        "True before every frame that is remembered or planned from"
+    )

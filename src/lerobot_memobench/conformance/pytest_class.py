@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import pytest
 
-from lerobot_memobench.conformance.checks import CHECKS, Behaviour, Outcome, run_check
+from lerobot_memobench.conformance.checks import CHECKS, FAILED, NO_MEMORY, NOT_CHECKED, Behaviour, run_check
 from lerobot_memobench.conformance.subject import load_subject
 
 
@@ -33,7 +33,7 @@ class MemoryConformance:
     def test_conformance(self, behaviour: Behaviour, check: str) -> None:
         """Run one check."""
         result = run_check(check, behaviour)
-        if result.outcome in (Outcome.NO_MEMORY, Outcome.NOT_CHECKED):
+        if result.outcome in (NO_MEMORY, NOT_CHECKED):
             pytest.skip(result.sentence)
-        if result.outcome is Outcome.FAILED:
+        if result.outcome is FAILED:
             pytest.fail(result.sentence, pytrace=False)

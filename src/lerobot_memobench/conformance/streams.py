@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.assembling import write_dataset
+from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
@@ -33,33 +33,22 @@ THINGS = 4
 def write_streams(
     folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
 ) -> Path:
-    """Write a dataset of three short episodes with the real columns and shapes and with synthetic values.
-
-    Args:
-        frames: of each execution. task: gives instruction and checkpoints. convention: of the pictures.
-    """
+    """Write a dataset of three episodes of few execution frames, with real columns and shapes and synthetic values."""
     episodes = (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS))
     return write_dataset(episodes, folder, convention=convention)
 
 
 def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
-    """Return a task with checkpoints that a memory knows, preferably with a prompt and many checkpoints.
-
-    Args:
-        subgoals: instruction -> texts that the memory was trained with. If no task fits, `TASK` is returned.
-    """
+    """Return a task for a memory's texts of each instruction, preferably with a prompt and many checkpoints."""
     known = {text for own in subgoals.values() for text in own}
-    found = [
-        task
-        for task in map(get_task, task_names(suite=None))
-        if task.language in subgoals and any(known.issuperset(texts) for texts in _texts_of_levels(task))
-    ]
-    best = max(found, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
+
+    def fits(task: Task) -> bool:
+        levels = zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
+        return task.language in subgoals and any(known.issuperset(texts) for texts in levels)
+
+    fitting = filter(fits, map(get_task, task_names(suite=None)))
+    best = max(fitting, key=lambda task: (task.prompt is not None, len(task.checkpoints)), default=None)
     return TASK if best is None else best.name
-
-
-def _texts_of_levels(task: Task) -> Iterator[tuple[str, ...]]:
-    return zip(*(checkpoint.language for checkpoint in task.checkpoints), strict=True)
 
 
 def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
@@ -76,7 +65,7 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
     slots = np.zeros((length, SLOTS, WIDTH), np.float32)
     position, rotation = STARTS["position"], STARTS["rotation"]
     for thing in range(THINGS):
-        slots[:, thing, : STARTS["position"]] = [1, 3 + thing]
+        slots[:, thing, :position] = [1, 3 + thing]
         slots[:, thing, position : position + 3] = [0, 0, 0.95] + 0.2 * moving(3)
         slots[:, thing, rotation : rotation + 6] = [1, 0, 0, 1, 0, 0]
     return Demonstration(
@@ -97,12 +86,12 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
 
 def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a coloured square that moves along places (T, 2) in [-1, 1]."""
-    found = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+    pictures = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
     corners = ((places + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
-    for picture, (top, left) in zip(found, corners, strict=True):
+    for picture, (top, left) in zip(pictures, corners, strict=True):
         picture[top : top + side, left : left + side] = colour
-    return found
+    return pictures
 
 
 @dataclass(frozen=True)
@@ -135,6 +124,10 @@ class Stream:
         """Return the stream that ends after a call."""
         return replace(self, frames=self.frames[: call + 1])
 
+    def only(self, call: int) -> Stream:
+        """Return the stream of one observation."""
+        return Stream(self.frames[call : call + 1], self.task, self.indices[call : call + 1])
+
     def showing(self, other: Stream, calls: Sequence[int]) -> Stream:
         """Return the stream with another one's observations at some calls; phase and step stay its own."""
         shown = {call: {**other.at(call), **{name: self.at(call)[name] for name in CLOCK}} for call in calls}
@@ -149,24 +142,23 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     Args:
         dataset: without delta timestamps.
         pictures: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first. If not,
-            streams have the order of the dataset.
+        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
         frames: number of execution frames that are not held.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
     table = read_frame_table(Path(dataset.root))
-    found: list[tuple[bool, tuple[int, ...], str]] = []
+    episodes: list[tuple[bool, tuple[int, ...], str]] = []
     for episode in dataset.meta.episodes:
         first, end = episode["dataset_from_index"], episode["dataset_to_index"]
         acting = (first + np.flatnonzero(table.acts[first:end])[:frames]).tolist()
         if acting:
             indices = range(first, acting[-1] + 1) if prompts else acting
             prompted = float(dataset.hf_dataset[first][OBS_PHASE]) != EXECUTION
-            found.append((not prompted, tuple(indices), episode["tasks"][0]))
+            episodes.append((not prompted, tuple(indices), episode["tasks"][0]))
     if prompts:
-        found.sort(key=lambda one: (one[0], len(one[1])))
-    for _, indices, task in found:
+        episodes.sort(key=lambda one: (one[0], len(one[1])))
+    for _, indices, task in episodes:
         shown: list[dict[str, Tensor]] = []
         for index in indices:
             item = dataset[index] if pictures else dataset.hf_dataset[index]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -17,13 +18,13 @@ from torch.overrides import TorchFunctionMode
 
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
 from lerobot_memobench.datasets.frames import read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import check_clock, objects_column
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
+from lerobot_memobench.datasets.layout import objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
-from lerobot_memobench.policies.convention import chosen_convention, trained_convention
+from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, parse_words, policy_config, read_words, setting_kind
@@ -84,24 +85,18 @@ class Subject:
             sparing: repeat earlier pictures and objects if the policy does not need new ones, and everything except
                 the clock if its next action is planned already, as evaluations do.
         """
-        actions = ActionQueue(self.policy)
+        actions, answers = ActionQueue(self.policy), []
         last: dict[str, Any] = {}
-        answers = []
         actions.reset()
         with EqualNoise() if equal_noise else nullcontext():
             for call in range(max(len(stream) for stream in streams)):
                 batch = self._batch(streams, call)
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
-                if sparing and not begins:
-                    kept = (
-                        [key for key in batch if key not in CLOCK]
-                        if actions.has_planned_action()
-                        else []
-                        if actions.needs_observation()
-                        else costly
-                    )
-                    batch |= {key: last[key] for key in kept}
+                if sparing and not begins and actions.has_planned_action():
+                    batch |= {key: last[key] for key in batch if key not in CLOCK}
+                elif sparing and not begins and not actions.needs_observation():
+                    batch |= {key: last[key] for key in costly}
                 last = batch
                 action = self.postprocessor(actions.select(self.preprocessor(batch)))
                 answers.append(action.to("cpu", torch.float32).numpy().copy())
@@ -113,11 +108,7 @@ class Subject:
         return batch | {"task": [stream.task for stream in streams]}
 
     def predict(self, stream: Stream, calls: Sequence[int]) -> Actions:
-        """Return the first actions (calls, A) of the chunks predicted for a training batch.
-
-        Args:
-            stream: an episode. calls: its frames that are the samples.
-        """
+        """Return the first actions (calls, A) of the chunks predicted for a training batch of these frames."""
         from lerobot.utils.collate import lerobot_collate_fn
 
         batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.indices[call]])] for call in calls])
@@ -137,18 +128,15 @@ class EqualNoise(TorchFunctionMode):
     The noise of a row then depends neither on the number of rows nor on earlier draws.
     """
 
-    RANDOM = (
-        *(torch.randn, torch.randn_like, torch.normal, torch.rand, torch.rand_like),
-        *(Tensor.normal_, Tensor.uniform_),
-    )
+    DRAWS = (torch.randn, torch.randn_like, torch.normal, torch.rand, torch.rand_like, Tensor.normal_, Tensor.uniform_)
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Call a function of torch, and replace the values that it drew."""
-        found = function(*args, **(kwargs or {}))
-        if function in self.RANDOM:
-            width = found.shape[-1] if found.dim() > 1 else 1
-            found.copy_(torch.rand(width, generator=torch.Generator().manual_seed(width)).to(found))
-        return found
+        drawn = function(*args, **(kwargs or {}))
+        if function in self.DRAWS:
+            width = drawn.shape[-1] if drawn.dim() > 1 else 1
+            drawn.copy_(torch.rand(width, generator=torch.Generator().manual_seed(width)).to(drawn))
+        return drawn
 
 
 def load_subject(words: Sequence[str], folder: Path) -> Subject:
@@ -157,9 +145,6 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     Args:
         words: ``policy=…``, settings of it, ``dataset=…``, ``obs_type=…``, as ``lerobot train`` takes them.
         folder: empty, for a dataset if none is named.
-
-    Raises:
-        MemobenchError: no policy is named, it cannot be built, or the dataset has too few episodes.
     """
     _, obs_type, given = take_training_options(parse_words(words))
     short = [key for key, fields in SHORT_FORMS["train"].items() if fields[0].startswith("policy.")]
@@ -208,10 +193,9 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_memobench.training.data import open_datasets, open_training
-    from lerobot_memobench.training.view import choice_for, needs_view, write_view
+    from lerobot_memobench.training.view import needs_view, view_options, write_view
 
     raw = LeRobotDataset(repository, root=root)
-    check_clock(raw.meta.features, raw.root)
     if not set(CLOCK) <= set(raw.meta.features):
         raise MemobenchError(f"{raw.root} has no {CLOCK[0]}; name a dataset of `memobench generate`, or none")
     path = config.pretrained_path
@@ -225,11 +209,11 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
         policy.open_loop = True
     else:
-        choice = choice_for(config, raw.meta.features, None, obs_type)
-        if not choice.prompts:
+        options = view_options(config, raw.meta.features, None, obs_type)
+        if not options.prompts:
             numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1
-        if needs_view(raw.meta.features, choice):
-            write_view(Path(raw.root), view, choice)
+        if needs_view(raw.meta.features, options):
+            write_view(Path(raw.root), view, options)
             whole.dataset.root = str(view)
         dataset = make_dataset(whole)
         policy = make_policy(config, ds_meta=dataset.meta)
@@ -240,8 +224,8 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     policy.eval()
     shown = obs_type_of(config) or PIXELS
     objects = objects_column(raw.meta.features) if shown in (OBJECTS, BOTH) else None
-    found = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
-    streams = [stream for stream, _ in zip(found, range(STREAMS), strict=False)]
+    episodes = read_streams(raw, shown in (PIXELS, BOTH), objects, reads_prompt(config), EXECUTION_FRAMES)
+    streams = [*itertools.islice(episodes, STREAMS)]
     if len(streams) < STREAMS:
         raise MemobenchError(f"{raw.root} has {len(streams)} episodes; name a dataset of at least {STREAMS}, or none")
     return Subject(config.type, policy, before, after, dataset, streams, raw.meta.camera_keys, numbers)

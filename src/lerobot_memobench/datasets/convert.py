@@ -1,12 +1,12 @@
 """Convert files in the published HDF5 layout to a LeRobotDataset.
 
-Each file is inspected, then its demonstrations are staged like generated ones (see `staging`). A file of a zip archive
+Each file is inspected, then its demonstrations are staged like generated ones (see `stage`). A file of a zip archive
 is unpacked before and removed afterwards: 340 GiB need not be unpacked at once. A file or group that cannot be used is
 reported with its reason. The same command continues a killed conversion and does not inspect finished files again.
 
 ::
 
-    <staging>/episodes/                 finished episodes, see `staging`
+    <staging>/episodes/                 finished episodes, see `stage`
               files/00003.json          `Findings` of the third file
               unpacked/<name>           the file of an archive that is being converted
 """
@@ -17,43 +17,35 @@ import shutil
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
 
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.generation import check_room, run_size
+from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
+from lerobot_memobench.datasets.generate import check_room, run_size
 from lerobot_memobench.datasets.hdf5 import (
     NO_SEED,
-    PublishedDemo,
     PublishedFile,
     Unusable,
     demo_number,
     first_line,
     unusable_on_error,
 )
-from lerobot_memobench.datasets.lerobot_format.assembling import assemble
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, STAGING
-from lerobot_memobench.datasets.lerobot_format.manifest import Problem
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.restore import (
-    ORIENTATIONS,
-    orientation_of,
-    restore,
-    task_of,
-    unlike_the_catalogue,
-)
-from lerobot_memobench.datasets.staging import (
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
+from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, restore, task_of, unlike_the_catalogue
+from lerobot_memobench.datasets.stage import (
     EpisodeStage,
     StagedJob,
     check_destination,
     episodes_folder,
     finished_manifest,
     stage_failure,
-    staged,
 )
+from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import (
     Count,
@@ -72,7 +64,7 @@ from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
-from lerobot_memobench.sim.libero.files import check_assets
+from lerobot_memobench.sim.files import check_assets
 
 SUFFIXES = (".hdf5", ".h5")
 MACOS_FOLDER = "__MACOSX"
@@ -83,19 +75,15 @@ UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
 
 @dataclass(frozen=True)
 class ConversionSummary:
-    """Outcome of a conversion.
+    """Outcome of a conversion: the dataset, None if no demonstration could be converted, and its number of episodes.
 
-    Attributes:
-        folder: the dataset, or None if no demonstration could be converted.
-        episodes: number of its episodes.
-        problems: files and groups that were left out, and why.
-        notes: differences between converted tasks and the catalogue's tasks of their names.
+    ``problems`` are the files and groups that were left out, ``notes`` differences of their tasks to the catalogue's.
     """
 
     folder: Path | None
     episodes: int
-    problems: tuple[Problem, ...]
-    notes: tuple[Problem, ...] = ()
+    problems: tuple[ConversionNote, ...]
+    notes: tuple[ConversionNote, ...] = ()
 
     @property
     def exit_status(self) -> int:
@@ -120,9 +108,7 @@ def convert(
     Args:
         source: the file, folder or archive.
         out: absent, empty, or an unfinished conversion of the same files.
-        repo_id: name of the dataset.
         convention: of the images in the dataset (`sim.convention`).
-        workers: number of processes.
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number,
             and its ``total`` is estimated from the files so far.
         notify: called with the size of the dataset before the first episode, and with each file of an archive.
@@ -135,11 +121,13 @@ def convert(
     check_assets()
     source, out = Path(source).absolute(), Path(out)
     staging = out / STAGING
-    files, refused = find_files(source, staging.absolute() / "unpacked")
+    files, problems = find_files(source, staging.absolute() / "unpacked")
     request = {"files": [file.identity for file in files], "convention": convention}
     manifest = finished_manifest(out, request, "left_out")
     if manifest is not None:
-        left_out, noted = (tuple(map(Problem.model_validate, manifest.get(key, []))) for key in ("left_out", "notes"))
+        left_out, noted = (
+            tuple(map(ConversionNote.model_validate, manifest.get(key, []))) for key in ("left_out", "notes")
+        )
         return ConversionSummary(out, len(manifest["episodes"]), left_out, noted)
     check_destination(out)
     with (
@@ -147,32 +135,33 @@ def convert(
         episodes_folder(out, request) as folder,
     ):
         _report_size(files, folder, out, notify)
-        conversion = _Conversion(source, staging, folder, convention, workers, progress, files)
+        shutil.rmtree(staging / "unpacked", ignore_errors=True)  # a killed run may have left a part
+        (staging / "files").mkdir(exist_ok=True)
+        conversion = _Conversion(source, staging, folder, convention, workers, progress, notify, files)
         for number, file in enumerate(files, 1):
-            conversion.add(number, file, notify)
-        problems, notes = [*conversion.problems, *refused], conversion.notes
-        good = [episode for episode in map(staged, conversion.jobs) if episode.failure is None]
-        if good:
+            conversion.add(number, file)
+        problems, notes = [*conversion.problems, *problems], conversion.notes
+        episodes = [job.episode() for job in conversion.jobs if job.failure() is None]
+        if episodes:
             made_by = (
                 f"Converted by `memobench convert` from {len(files)} HDF5 files in the published layout; columns that "
                 "they do not hold were computed from their states in the simulator."
             )
+            content = {"request": request, "left_out": [problem.model_dump() for problem in problems]}
+            if notes:
+                content["notes"] = [note.model_dump() for note in notes]
             assemble(
-                good,
+                episodes,
                 out,
                 repo_id=repo_id,
                 made_by=made_by + "".join(f" {note}." for note in notes),
-                manifest={
-                    "request": request,
-                    "left_out": [problem.model_dump() for problem in problems],
-                    **({"notes": [note.model_dump() for note in notes]} if notes else {}),
-                },
+                manifest=content,
                 left_out=[str(problem) for problem in problems],
             )
         shutil.rmtree(staging, ignore_errors=True)
     if not any(out.iterdir()):
         out.rmdir()
-    return ConversionSummary(out if good else None, len(good), tuple(problems), tuple(notes))
+    return ConversionSummary(out if episodes else None, len(episodes), tuple(problems), tuple(notes))
 
 
 # --- the files ---
@@ -185,7 +174,6 @@ class SourceFile:
     Attributes:
         name: path within the source.
         size: bytes, unpacked.
-        path: place where it is read.
         identity: distinguishes it from another file of the same name.
         member: its entry in an archive, from which it is unpacked to ``path``; None for a file of a folder.
     """
@@ -197,11 +185,10 @@ class SourceFile:
     member: zipfile.ZipInfo | None = None
 
 
-def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Problem]]:
+def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[ConversionNote]]:
     """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
 
-    Args:
-        source: a file, a folder, or a zip archive, whose files are unpacked below ``unpacked``.
+    An archive's files will be unpacked below ``unpacked``.
 
     Raises:
         MemobenchError: there is none, or the archive is damaged.
@@ -215,13 +202,12 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Pro
                 name = "/".join(file_name(part, "a part of its name") for part in info.filename.split("/"))
             except MemobenchError as error:
                 printable = "".join(letter if letter.isprintable() else "?" for letter in info.filename)[:200]
-                refused.append(Problem(file=printable, group="", reason=str(error)))
+                refused.append(ConversionNote(file=printable, group="", reason=str(error)))
             else:
                 identity = [name, info.file_size, info.CRC]
                 files.append(SourceFile(name, info.file_size, unpacked / name, identity, info))
     else:
-        paths = files_below(source, *SUFFIXES) if source.is_dir() else [source]
-        for path in paths:
+        for path in files_below(source, *SUFFIXES) if source.is_dir() else [source]:
             name, stat = path.name if path == source else path.relative_to(source).as_posix(), path.stat()
             files.append(SourceFile(name, stat.st_size, path, [name, stat.st_size, stat.st_mtime_ns]))
     if not files and not refused:
@@ -232,7 +218,6 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Pro
 
 
 def _entries(archive: Path) -> list[zipfile.ZipInfo]:
-    """Return the entries of an archive's HDF5 files, sorted by name."""
     check_fetched(archive)
     try:
         with zipfile.ZipFile(archive) as file:
@@ -241,16 +226,12 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
         raise MemobenchError(
             f"{archive} is no zip archive, or was not downloaded completely ({first_line(error)}); download it again"
         ) from None
-    found = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith(MACOS_FOLDER)]
-    return sorted(found, key=lambda entry: entry.filename)
+    chosen = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith(MACOS_FOLDER)]
+    return sorted(chosen, key=lambda entry: entry.filename)
 
 
 def unpack(archive: Path, file: SourceFile) -> None:
-    """Write a file of an archive to its path.
-
-    Raises:
-        Unusable: it cannot be unpacked, or has another length than stated.
-    """
+    """Write a file of an archive to its path, or raise `Unusable`."""
     assert file.member is not None
     file.path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -264,42 +245,37 @@ def unpack(archive: Path, file: SourceFile) -> None:
 
 
 def _report_size(files: Sequence[SourceFile], folder: Path, out: Path, notify: Callable[[str], None]) -> None:
-    """Report the size of the dataset, and of the largest unpacked file, before either is made."""
     total, largest = sum(file.size for file in files), max((file.size for file in files), default=0)
     size = run_size(total // UNPACKED_FRAME, IMAGE_SIZE)
-    there = sum(path.stat().st_size for path in files_below(folder))
+    staged_size = sum(path.stat().st_size for path in files_below(folder))
     work, extra = f"{count_of(len(files), 'file')} of {in_words(total)}", 0
     if any(file.member is not None for file in files):
         work, extra = f"{work}, unpacked one by one (up to {in_words(largest)})", largest
-    check_room(out, size, min(there, size), notify, work, extra=extra)
+    check_room(out, size, min(staged_size, size), notify, work, extra=extra)
 
 
 # --- inspection of a file ---
 
 
-class Sound(BaseModel):
-    """A demonstration that can be converted: its group, and height and width of its images."""
-
-    group: str
-    height: Count
-    width: Count
-
-
 class Findings(BaseModel):
-    """Demonstrations, problems and notes of a file, and how its images are stored."""
+    """Problems and notes of a file, how its images are stored, and its sound groups with height and width of images."""
 
-    demonstrations: list[Sound] = []
-    problems: list[Problem] = []
-    notes: list[Problem] = []
+    demonstrations: dict[str, list[Count]] = {}
+    problems: list[ConversionNote] = []
+    notes: list[ConversionNote] = []
     orientation: str | None = None
 
 
 def inspect(file: SourceFile) -> Findings:
     """Return the findings of a file."""
-    found = Findings()
+    findings = Findings()
 
     def leave_out(group: str, reason: object) -> None:
-        found.problems.append(Problem(file=file.name, group=group, reason=str(reason)))
+        findings.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
+
+    def note(reason: str) -> None:
+        one = ConversionNote(file=file.name, group="", reason=reason)
+        findings.notes += [one] * (one not in findings.notes)
 
     try:
         with PublishedFile(file.path) as opened, unusable_on_error():
@@ -311,132 +287,104 @@ def inspect(file: SourceFile) -> Findings:
             for group in groups:
                 try:
                     demo = opened.read(group)
-                    found.orientation = found.orientation or orientation_of(opened, demo)
+                    findings.orientation = findings.orientation or orientation_of(opened, demo)
                 except Unusable as error:
                     leave_out(f"data/{group}", error)
                     continue
-                height, width = demo.image_size
-                found.demonstrations.append(Sound(group=group, height=height, width=width))
-                notes = [Problem(file=file.name, group="", reason=note) for note in _notes(opened, demo)]
-                found.notes += [note for note in notes if note not in found.notes]
+                findings.demonstrations[group] = [*demo.image_size]
+                with suppress(MemobenchError):  # its conversion reports it
+                    task = task_of(opened, demo).variant(0)
+                    if differences := unlike_the_catalogue(task):
+                        note(differences)
+                    if opened.lacks_its_text:
+                        note(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
     except Unusable as error:
         leave_out("", error)
-    if found.demonstrations and found.orientation != UPRIGHT:
-        unclear = "whether its images are upright is not clear, as its state shows none like them: they are not turned"
-        turned = f"its images are {found.orientation}: they are turned"
-        found.notes.append(Problem(file=file.name, group="", reason=turned if found.orientation else unclear))
-    return found
-
-
-def _notes(file: PublishedFile, demo: PublishedDemo) -> list[str]:
-    """Return differences of a demonstration's task to the catalogue's; errors are reported by its conversion."""
-    try:
-        task = task_of(file, demo).variant(0)
-        notes = [unlike_the_catalogue(task)]
-    except MemobenchError:
-        return []
-    if file.lacks_its_text:
-        notes.append(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
-    return [note for note in notes if note]
+    if findings.demonstrations and findings.orientation is None:
+        note("whether its images are upright is not clear, as its state shows none like them: they are not turned")
+    elif findings.demonstrations and findings.orientation != UPRIGHT:
+        note(f"its images are {findings.orientation}: they are turned")
+    return findings
 
 
 # --- conversion ---
 
 
+@dataclass
 class _Conversion:
-    """Stage the episodes of one file after another.
+    """Stage the episodes of one file after another; ``resumed`` counts those that an earlier run had made."""
 
-    Attributes:
-        jobs: one per demonstration that can be converted, all of them run.
-        problems, notes: of the files so far, in their order.
-    """
+    source: Path
+    staging: Path
+    folder: Path
+    convention: str
+    workers: int
+    progress: ProgressCallback | None
+    notify: Callable[[str], None]
+    files: Sequence[SourceFile]
+    jobs: list[ConversionJob] = field(default_factory=list)
+    problems: list[ConversionNote] = field(default_factory=list)
+    notes: list[ConversionNote] = field(default_factory=list)
+    resumed: int = 0
 
-    def __init__(
-        self,
-        source: Path,
-        staging: Path,
-        folder: Path,
-        convention: str,
-        workers: int,
-        progress: ProgressCallback | None,
-        files: Sequence[SourceFile],
-    ) -> None:
-        self.jobs: list[ConversionJob] = []
-        self.problems: list[Problem] = []
-        self.notes: list[Problem] = []
-        self._source, self._staging, self._folder, self._convention = source, staging, folder, convention
-        self._workers, self._progress, self._files = workers, progress, files
-        self._resumed = 0
-        shutil.rmtree(staging / "unpacked", ignore_errors=True)  # a killed run may have left a part
-        (staging / "files").mkdir(exist_ok=True)
-
-    def add(self, number: int, file: SourceFile, notify: Callable[[str], None]) -> None:
+    def add(self, number: int, file: SourceFile) -> None:
         """Inspect a file and stage its demonstrations; ``number`` counts from 1."""
-        record = self._staging / "files" / f"{number:05d}.json"
-        findings = _read_findings(record)
+        path = self.staging / "files" / f"{number:05d}.json"
+        findings: Findings | None = None
+        if path.exists():
+            findings = read_json(path, Findings, "delete it to inspect the file again")
         if file.member is not None and not (findings and all(job.finished() for job in self._jobs_of(file, findings))):
-            notify(f"file {number} of {len(self._files)}: {file.name}, {in_words(file.size)}")
+            self.notify(f"file {number} of {len(self.files)}: {file.name}, {in_words(file.size)}")
             findings = self._unpack(file, findings)
         if findings is None:
             findings = inspect(file)
-        write_file(record, findings.model_dump_json(), durable=True)
+        write_file(path, findings.model_dump_json(), durable=True)
         jobs = self._jobs_of(file, findings)
-        run_jobs(jobs, workers=self._workers, progress=self._progress and self._counting(number, len(jobs)))
+        run_jobs(jobs, workers=self.workers, progress=self.progress and self._counting(number, len(jobs)))
         self.jobs += jobs
         if file.member is not None:
             file.path.unlink(missing_ok=True)
-        failed = [(f"data/{job.group}", reason) for job in jobs if (reason := job.failure()) is not None]
-        self.problems += [
-            *findings.problems,
-            *(Problem(file=file.name, group=group, reason=reason) for group, reason in failed),
-        ]
         self.notes += findings.notes
+        self.problems += findings.problems
+        for job in jobs:
+            if (reason := job.failure()) is not None:
+                self.problems.append(ConversionNote(file=file.name, group=f"data/{job.group}", reason=reason))
 
     def _unpack(self, file: SourceFile, findings: Findings | None) -> Findings | None:
-        """Unpack a file of the archive; return its findings, or the reason if it cannot be unpacked."""
-        if (free := free_bytes(self._staging)) < file.size:
+        if (free := free_bytes(self.staging)) < file.size:
             raise MemobenchError(
-                f"{file.name} takes {in_words(file.size)} unpacked, but {in_words(free)} are free in {self._staging}; "
+                f"{file.name} takes {in_words(file.size)} unpacked, but {in_words(free)} are free in {self.staging}; "
                 "make room, then repeat the command to continue"
             )
         try:
-            unpack(self._source, file)
+            unpack(self.source, file)
         except Unusable as error:
             if findings is not None:  # an earlier run found its demonstrations
-                raise MemobenchError(f"{self._source}, {file.name}: {error}") from None
-            problem = Problem(file=file.name, group="", reason=str(error))
-            return Findings(problems=[problem])
+                raise MemobenchError(f"{self.source}, {file.name}: {error}") from None
+            return Findings(problems=[ConversionNote(file=file.name, group="", reason=str(error))])
         return findings
 
     def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:
         """Return the jobs of a file; they refuse images of another size than the first demonstration's."""
-        first, jobs = len(self.jobs), list[ConversionJob]()
-        for number, demo in enumerate(findings.demonstrations, first):
-            size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (demo.height, demo.width))
-            turn, folder = ORIENTATIONS[findings.orientation or UPRIGHT], self._folder / f"{number:06d}"
-            jobs.append(ConversionJob(file.path, demo.group, folder, size, turn, self._convention))
+        jobs: list[ConversionJob] = []
+        turn = ORIENTATIONS[findings.orientation or UPRIGHT]
+        for number, (group, (height, width)) in enumerate(findings.demonstrations.items(), len(self.jobs)):
+            size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (height, width))
+            jobs.append(ConversionJob(file.path, group, self.folder / f"{number:06d}", size, turn, self.convention))
         return jobs
 
     def _counting(self, number: int, jobs: int) -> ProgressCallback:
         """Return the callback of a file's jobs; later files are assumed to have as many episodes per byte."""
-        before, resumed = len(self.jobs), self._resumed
-        read, size = (sum(file.size for file in files) for files in (self._files[:number], self._files))
+        before, resumed = len(self.jobs), self.resumed
+        read, size = (sum(file.size for file in files) for files in (self.files[:number], self.files))
         total = round((before + jobs) * size / max(read, 1))
 
         def advance(news: Advance) -> None:
-            self._resumed = resumed + news.found
-            assert self._progress is not None
-            self._progress(replace(news, done=before + news.done, total=total, found=self._resumed))
+            self.resumed = resumed + news.found
+            assert self.progress is not None
+            self.progress(replace(news, done=before + news.done, total=total, found=self.resumed))
 
         return advance
-
-
-def _read_findings(record: Path) -> Findings | None:
-    try:
-        found: Findings = read_json(record, Findings, "delete it to inspect the file again")
-    except FileNotFoundError:
-        return None
-    return found
 
 
 @dataclass(frozen=True)
@@ -447,8 +395,8 @@ class ConversionJob(StagedJob):
     group: str
     folder: Path
     image_size: tuple[int, int]
-    turn: tuple[int, int] = ORIENTATIONS[UPRIGHT]
-    convention: str = UPRIGHT
+    turn: tuple[int, int]
+    convention: str
 
     @property
     def task_name(self) -> str:
@@ -478,12 +426,12 @@ class ConversionJob(StagedJob):
 
     def _restored(self, file: PublishedFile) -> Demonstration:
         with unusable_on_error():
-            found = file.read(self.group)
-            if found.image_size != self.image_size:
+            demo = file.read(self.group)
+            if demo.image_size != self.image_size:
                 raise Unusable(
-                    f"its images are {found.image_size[0]}×{found.image_size[1]} pixels, those of the first "
+                    f"its images are {demo.image_size[0]}×{demo.image_size[1]} pixels, those of the first "
                     f"demonstration {self.image_size[0]}×{self.image_size[1]}"
                 )
-            demo = restore(task_of(file, found), found)
-            EpisodeRecord.of(demo)  # a bad value ends this episode, not the assembly of all
-            return demo
+            restored = restore(task_of(file, demo), demo)
+            DemonstrationRecord.of(restored)  # a bad value ends this episode, not the assembly of all
+            return restored

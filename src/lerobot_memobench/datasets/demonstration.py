@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -38,16 +39,18 @@ style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
 LEVEL_COLUMNS = {level: f"subgoal.{level}" for level in LEVELS}
 """Level of a checkpoint's text -> column with its text at every frame."""
 INSTRUCTION_COLUMN, MEMORY_COLUMN, HELD_COLUMN = "subgoal.instruction", "oracle_memory", "held"
-EARLIER_COLUMNS = {
-    "coarse_subgoal": LEVEL_COLUMNS["coarse"],
+HASHED = {
+    "index": "checkpoint.index",
+    "operation": "checkpoint.operation",
+    "completed": "checkpoint.completed",
+    "event": "checkpoint.event",
     "simple_subgoal": LEVEL_COLUMNS["intermediate"],
     "grounded_subgoal": LEVEL_COLUMNS["fine"],
     "memory": MEMORY_COLUMN,
 }
-"""Column of datasets before version 0.3 -> its present name. Version 0.3 reads both, and the second and third are those
-of RoboMME's datasets too."""
-NOT_HASHED = ("step", "coarse_subgoal", "subtask", "held")
-"""Labels that are not part of an episode's hash."""
+"""Name of a label in an episode's hash -> its column."""
+Labels = dict[str, Any]
+"""Column -> T values: an array, or a list of texts."""
 LanguageRow = dict[str, Any]
 
 
@@ -57,7 +60,6 @@ class Demonstration:
 
     Attributes:
         task: the performed variant of the task: ``task.variant(k)`` for ``variant`` k > 0.
-        seed: seed of the scene.
         referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
         variant: number of the requested referent or order; 0 is the published one.
         states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
@@ -68,7 +70,6 @@ class Demonstration:
             whose actions are zeros.
         satisfied: (T, K) bool, whether the predicate of checkpoint k is true at frame t; false in the prompt.
             Predicates are evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
-        success: whether the goal was reached.
         objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
         fixture_poses: fixture name to (7,) position and quaternion wxyz.
         scene_hash: hash of the initial scene, or empty.
@@ -100,50 +101,42 @@ class Demonstration:
     held: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        length = len(self.states)
-        self._check("states", self.states, np.float64, (length, None))
-        self._check("actions", self.actions, np.float32, (length, ACTION_DIM))
-        self._check("proprio", self.proprio, np.float32, (length, PROPRIO_DIM))
-        self._check("satisfied", self.satisfied, np.bool_, (length, len(self.task.checkpoints)))
-        self._check("objects", self.objects, np.float32, (length, None))
-        if self.executed is not None:
-            self._check("executed", self.executed, np.float32, (length, ACTION_DIM))
-        if self.held is not None:
-            self._check("held", self.held, np.bool_, (length,))
-        if self.images is not None:
-            for camera, frames in self.images.items():
-                self._check(f"images[{camera!r}]", frames, np.uint8, (length, None, None, 3))
-            if set(self.images) != set(CAMERAS):
-                raise MemobenchError(
-                    f"{self._where()}: images of {sorted(self.images)} given, expected {sorted(CAMERAS)} or none"
-                )
+        problem = next(self._problems(), None)
+        if problem is not None:
+            raise MemobenchError(f"demonstration of {self.task.name} with seed {self.seed}: {problem}")
+
+    def _problems(self) -> Iterator[str]:
+        length, images = len(self.states), self.images or {}
+        arrays: dict[str, tuple[NDArray | None, type, tuple[int | None, ...]]] = {
+            "states": (self.states, np.float64, (None,)),
+            "actions": (self.actions, np.float32, (ACTION_DIM,)),
+            "proprio": (self.proprio, np.float32, (PROPRIO_DIM,)),
+            "satisfied": (self.satisfied, np.bool_, (len(self.task.checkpoints),)),
+            "objects": (self.objects, np.float32, (None,)),
+            "executed": (self.executed, np.float32, (ACTION_DIM,)),
+            "held": (self.held, np.bool_, ()),
+            **{f"images[{camera!r}]": (frames, np.uint8, (None, None, 3)) for camera, frames in images.items()},
+        }
+        for name, (array, dtype, widths) in arrays.items():
+            if array is None:
+                continue
+            expected = tuple("any" if n is None else n for n in (length, *widths))
+            same_shape = array.ndim == len(expected) and all(map(lambda n, m: n in ("any", m), expected, array.shape))
+            if array.dtype != np.dtype(dtype) or not same_shape:
+                types = f"{name} has type {array.dtype} and shape {array.shape}"
+                yield f"{types}, expected {np.dtype(dtype)} and {expected}"
+        if images and set(images) != set(CAMERAS):
+            yield f"images of {sorted(images)} given, expected {sorted(CAMERAS)} or none"
         if not 0 <= self.exec_start < length:
-            raise MemobenchError(
-                f"{self._where()}: execution starts at frame {self.exec_start} of {length}; "
-                "expected one of the episode's frames"
-            )
+            yield f"execution starts at frame {self.exec_start} of {length}; expected one of the episode's frames"
         if self.satisfied[: self.exec_start].any():
-            raise MemobenchError(
-                f"{self._where()}: a checkpoint is satisfied in the demonstration prompt, before frame "
-                f"{self.exec_start}; checkpoints count from the start of execution only"
-            )
-
-    def _where(self) -> str:
-        return f"demonstration of {self.task.name} with seed {self.seed}"
-
-    def _check(self, name: str, array: NDArray, dtype: type, shape: tuple[int | None, ...]) -> None:
-        matches = len(array.shape) == len(shape) and all(
-            want is None or have == want for have, want in zip(array.shape, shape, strict=False)
-        )
-        if array.dtype != np.dtype(dtype) or not matches:
-            want = tuple("any" if n is None else n for n in shape)
-            raise MemobenchError(
-                f"{self._where()}: {name} has type {array.dtype} and shape {array.shape}, "
-                f"expected {np.dtype(dtype)} and {want}"
+            yield (
+                f"a checkpoint is satisfied in the demonstration prompt, before frame {self.exec_start}; checkpoints "
+                "count from the start of execution only"
             )
 
     def __len__(self) -> int:
-        """Return T, the number of frames, demonstration prompt included."""
+        """Return T, demonstration prompt included."""
         return len(self.states)
 
     @property
@@ -155,65 +148,13 @@ class Demonstration:
 # --- labels ---
 
 
-@dataclass(frozen=True, eq=False)
-class Labels:
-    """Per-frame columns of one episode of T frames; see `columns` for their names in a dataset.
-
-    Attributes:
-        phase: (T,) int64, 0 prompt, 1 execution.
-        step: (T,) int64, control steps since the phase began; `NO_CLOCK` in the execution of a strict task.
-        held: (T,) bool, whether the action at frame t of the execution has no effect.
-        index: (T,) int64, number of checkpoints completed in order before frame t: index of the present one.
-        operation: (T,) int64, 0 S, 1 U, 2 C of the present checkpoint, -1 after the last one.
-        completed: (T, 6) bool, whether checkpoint k was satisfied at any frame up to and including t.
-        event: (T,) bool, whether any checkpoint is satisfied for the first time at frame t.
-        simple_subgoal: T strings, intermediate-level text of the present checkpoint. After the last one its text
-            remains (``operation`` is -1 there), so the column is never empty.
-        grounded_subgoal, coarse_subgoal: the same at the fine and at the coarse level.
-        memory: T strings, intermediate-level texts of the checkpoints completed in order before t, joined by
-            "; "; empty at the start. The oracle memory of the paper (:mod:`lerobot_memobench.tasks.memory_text`).
-        subtask: T strings, the intermediate-level text of the present checkpoint as an instruction.
-        key_frames: (K,) int64, frame at which checkpoint k was completed in order, -1 if it never was.
-    """
-
-    phase: NDArray[np.int64]
-    step: NDArray[np.int64]
-    held: NDArray[np.bool_]
-    index: NDArray[np.int64]
-    operation: NDArray[np.int64]
-    completed: NDArray[np.bool_]
-    event: NDArray[np.bool_]
-    simple_subgoal: list[str]
-    grounded_subgoal: list[str]
-    coarse_subgoal: list[str]
-    memory: list[str]
-    subtask: list[str]
-    key_frames: NDArray[np.int64]
-
-    def columns(self) -> dict[str, NDArray | list[str]]:
-        """Return the dataset's column names and their T values each."""
-        return {
-            OBS_PHASE: self.phase.astype(np.float32),
-            OBS_STEP: self.step.astype(np.float32),
-            HELD_COLUMN: self.held,
-            "checkpoint.index": self.index,
-            "checkpoint.operation": self.operation,
-            "checkpoint.completed": self.completed,
-            "checkpoint.event": self.event,
-            LEVEL_COLUMNS["coarse"]: self.coarse_subgoal,
-            LEVEL_COLUMNS["intermediate"]: self.simple_subgoal,
-            LEVEL_COLUMNS["fine"]: self.grounded_subgoal,
-            INSTRUCTION_COLUMN: self.subtask,
-            MEMORY_COLUMN: self.memory,
-        }
-
-
 def labels(demo: Demonstration) -> Labels:
-    """Compute every checkpoint column of a demonstration.
+    """Return the label columns of a demonstration by their names in a dataset, T values each (`layout.COLUMNS`).
 
     A checkpoint is completed in order at the first frame at which its predicate is true and all earlier checkpoints
     were completed at this frame or before. Several may be completed at one frame. A predicate that was true too early
-    and is false in its turn is not completed in order; ``completed`` and ``event`` ignore the order.
+    and is false in its turn is not completed in order; ``completed`` and ``event`` ignore the order. After the last
+    checkpoint its texts remain, so the columns of subgoals are never empty.
     """
     task, length = demo.task, len(demo)
     if len(task.checkpoints) > MAX_CHECKPOINTS:
@@ -221,57 +162,51 @@ def labels(demo: Demonstration) -> Labels:
             f"task {task.name} has {len(task.checkpoints)} checkpoints; the column checkpoint.completed has room for "
             f"{MAX_CHECKPOINTS}; merge some of them"
         )
-    key_frames = _ordered_completion(demo.satisfied)
-    index = np.searchsorted(key_frames[key_frames >= 0], np.arange(length), side="left").astype(np.int64)
+    completion = key_frames(demo)
+    # An event's own frame does not count: its checkpoint is the present one until the next frame.
+    index = np.searchsorted(completion[completion >= 0], np.arange(length), side="left").astype(np.int64)
     ever = np.logical_or.accumulate(demo.satisfied, axis=0)
     # One entry per value of index, 0 ... K; the last follows the last checkpoint. A code is a position in "SUC".
     codes = [OPERATIONS.index(checkpoint.operation) for checkpoint in task.checkpoints] + [-1]
-    texts = {level: _subgoals(task, number) for number, level in enumerate(LEVELS)}
-    subtasks = subtask_texts(task)
-    subtasks.append(subtasks[-1])
-    memories = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
-    frames = np.arange(length, dtype=np.int64)
+    texts = {
+        LEVEL_COLUMNS[level]: [checkpoint.language[number] for checkpoint in task.checkpoints] or [task.language]
+        for number, level in enumerate(LEVELS)
+    }
+    texts[INSTRUCTION_COLUMN] = subtask_texts(task)
+    texts = {column: [*of_index, of_index[-1]] for column, of_index in texts.items()}
+    texts[MEMORY_COLUMN] = [memory_text(task, k) for k in range(len(task.checkpoints) + 1)]
+    frames = np.arange(length)
     acting = frames >= demo.exec_start
-    return Labels(
-        phase=np.where(acting, EXECUTION, PROMPT).astype(np.int64),
-        step=np.where(acting, NO_CLOCK if task.suite == STRICT else frames - demo.exec_start, frames),
-        held=np.zeros(length, np.bool_) if demo.held is None else demo.held,
-        index=index,
-        operation=np.array(codes, dtype=np.int64)[index],
-        completed=np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
-        event=np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
-        simple_subgoal=[texts["intermediate"][k] for k in index],
-        grounded_subgoal=[texts["fine"][k] for k in index],
-        coarse_subgoal=[texts["coarse"][k] for k in index],
-        memory=[memories[k] for k in index],
-        subtask=[subtasks[k] for k in index],
-        key_frames=key_frames,
-    )
+    step = np.where(acting, NO_CLOCK if task.suite == STRICT else frames - demo.exec_start, frames)
+    return {
+        OBS_PHASE: np.where(acting, EXECUTION, PROMPT).astype(np.float32),
+        OBS_STEP: step.astype(np.float32),
+        HELD_COLUMN: np.zeros(length, np.bool_) if demo.held is None else demo.held,
+        "checkpoint.index": index,
+        "checkpoint.operation": np.array(codes, dtype=np.int64)[index],
+        "checkpoint.completed": np.pad(ever, [(0, 0), (0, MAX_CHECKPOINTS - ever.shape[1])]),
+        "checkpoint.event": np.asarray(np.diff(ever, axis=0, prepend=False).any(axis=1)),
+        **{column: [of_index[k] for k in index] for column, of_index in texts.items()},
+    }
 
 
-def _ordered_completion(satisfied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return (K,) frames of ordered completion in a (T, K) truth table, -1 for never."""
-    key_frames = np.full(satisfied.shape[1], -1, dtype=np.int64)
+def key_frames(demo: Demonstration) -> NDArray[np.int64]:
+    """Return the frame (K,) at which each checkpoint was completed in order (`labels`), -1 if it never was."""
+    completion = np.full(demo.satisfied.shape[1], -1, dtype=np.int64)
     frame = 0
-    for k in range(satisfied.shape[1]):
-        holds = np.flatnonzero(satisfied[frame:, k])
+    for k in range(demo.satisfied.shape[1]):
+        holds = np.flatnonzero(demo.satisfied[frame:, k])
         if holds.size == 0:
             break
         frame += int(holds[0])  # the next checkpoint may hold at this same frame
-        key_frames[k] = frame
-    return key_frames
-
-
-def _subgoals(task: Task, level: int) -> list[str]:
-    """Return K + 1 texts, the last one repeated; a task without checkpoints has its instruction."""
-    texts = [checkpoint.language[level] for checkpoint in task.checkpoints] or [task.language]
-    return [*texts, texts[-1]]
+        completion[k] = frame
+    return completion
 
 
 # --- language rows ---
 
 
-def persistent_rows(found: Labels) -> list[LanguageRow]:
+def persistent_rows(columns: Labels) -> list[LanguageRow]:
     """Return an episode's language rows for LeRobot's training recipes, sorted by timestamp, style, role.
 
     LeRobot stores them in the column ``language_persistent``: one list per episode, repeated on every frame, each row
@@ -282,13 +217,12 @@ def persistent_rows(found: Labels) -> list[LanguageRow]:
     A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins, so
     no row names a completion too early. The per-frame string columns contain every change.
     """
-    rows = [_row("subtask", text, frame) for frame, text in _changes(found.subtask)]
-    rows += [_row("memory", text, frame) for frame, text in _changes(found.memory) if text]
+    rows = [_row("subtask", text, frame) for frame, text in _changes(columns[INSTRUCTION_COLUMN])]
+    rows += [_row("memory", text, frame) for frame, text in _changes(columns[MEMORY_COLUMN]) if text]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))
 
 
 def _changes(texts: list[str]) -> list[tuple[int, str]]:
-    """Return (frame, text) wherever a text begins, without empty and short-lived ones."""
     kept: list[tuple[int, str]] = []
     for frame, text in enumerate(texts):
         if not text or (frame > 0 and text == texts[frame - 1]):
@@ -322,10 +256,9 @@ def digest(demo: Demonstration) -> str:
     """Return the sha256 (hex) of an episode: identity, states, actions and the label columns.
 
     Images are not hashed: they are determined by the states, and a renderer may differ in a pixel where physics does
-    not. Visible objects and the labels of `NOT_HASHED` are determined by the other columns too; hashing them would
-    change the hashes of earlier datasets.
+    not. Visible objects and the other labels are determined by the hashed columns too.
     """
-    found = labels(demo)
+    frame_labels = labels(demo)
     identity = {
         "task": demo.task.name,
         "seed": demo.seed,
@@ -335,13 +268,14 @@ def digest(demo: Demonstration) -> str:
         "success": bool(demo.success),
         WORLD: LIBERO,
     }
-    columns: dict[str, NDArray | list[str]] = {"states": demo.states, "actions": demo.actions}
+    columns: Labels = {"states": demo.states, "actions": demo.actions, "key_frames": key_frames(demo)}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    if found.held.any():  # an added column changes no hash of demonstrations without holds
-        columns["held"] = found.held
-    columns |= {f.name: getattr(found, f.name) for f in fields(found) if f.name not in NOT_HASHED}
-    # Independent of byte order, memory layout and dictionary order.
+    if demo.held is not None and demo.held.any():
+        columns["held"] = demo.held
+    columns |= {name: frame_labels[column] for name, column in HASHED.items()}
+    columns["phase"] = frame_labels[OBS_PHASE].astype(np.int64)
+    # The hash is independent of byte order, memory layout and dictionary order.
     sha = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
     for name in sorted(columns):
         column = columns[name]

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS, PRIVILEGED, check_clock, objects_column
-from lerobot_memobench.datasets.lerobot_format.tables import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
+from lerobot_memobench.datasets.episodes import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.layout import OBJECTS, PRIVILEGED, objects_column
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CLOCK, OBS_PHASE, PROMPT
+from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 
 _PLACE = ("index", "episode_index", "frame_index")
 
@@ -28,7 +28,7 @@ class FrameTable:
     """Phases and texts of a dataset of E episodes and N frames.
 
     Attributes:
-        episodes: (E + 1,) int64, first frame of each episode.
+        episodes: (E + 1,) int64, first frame of each episode, and N.
         phase: (N,) uint8.
         held: (N,) bool, whether the scene is held in the execution.
         subgoals: level to (N,) texts.
@@ -62,12 +62,10 @@ def read_frame_table(root: Path) -> FrameTable:
     Raises:
         MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
     """
-    wanted = {*_PLACE, *CLOCK, "phase", HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
-    table = read_table(root / "data", lambda name: EARLIER_COLUMNS.get(name, name) in wanted)
-    check_clock(table.column_names, root)
-    table = table.rename_columns([EARLIER_COLUMNS.get(name, name) for name in table.column_names]).sort_by("index")
-    there = set(table.column_names)
-    number = {name: numbers(table.column(name)).reshape(-1) for name in {*_PLACE, OBS_PHASE, HELD_COLUMN} & there}
+    wanted = {*_PLACE, OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
+    table = read_table(root / "data", wanted.__contains__).sort_by("index")
+    names = {*table.column_names}
+    number = {name: numbers(table.column(name)).reshape(-1) for name in {*_PLACE, OBS_PHASE, HELD_COLUMN} & names}
     starts, expected = np.flatnonzero(number["frame_index"] == 0), np.arange(len(table))
     episode = np.searchsorted(starts, expected, "right") - 1
     if not (np.array_equal(number["index"], expected) and np.array_equal(number["episode_index"], episode)):
@@ -78,43 +76,24 @@ def read_frame_table(root: Path) -> FrameTable:
         episodes=np.append(starts, len(table)).astype(np.int64),
         phase=number.get(OBS_PHASE, np.ones(len(table))).astype(np.uint8),
         held=number.get(HELD_COLUMN, np.zeros(len(table))).astype(np.bool_),
-        subgoals={level: texts(table.column(name)) for level, name in LEVEL_COLUMNS.items() if name in there},
-        memory=texts(table.column(MEMORY_COLUMN)) if MEMORY_COLUMN in there else None,
+        subgoals={level: texts(table.column(name)) for level, name in LEVEL_COLUMNS.items() if name in names},
+        memory=texts(table.column(MEMORY_COLUMN)) if MEMORY_COLUMN in names else None,
     )
 
 
-def resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
+def _resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
     """Assign to each frame without a text that of the next annotated frame of its episode, or else of the last one.
 
-    Args:
-        rows: (N,) text number per frame, -1 where a frame has none.
-        episodes: (E + 1,) first frame of each episode.
-
-    Returns:
-        (N,) text numbers; -1 remains in episodes without any text only (paper, framewise alignment).
+    ``rows`` (N,) are text numbers, -1 for none, which remains in episodes without any text only (paper, framewise
+    alignment).
     """
     resolved = rows.copy()
     for start, end in itertools.pairwise(episodes):
         annotated = np.flatnonzero(rows[start:end] >= 0)
-        if len(annotated) == 0:
-            continue
-        following = np.searchsorted(annotated, np.arange(end - start)).clip(max=len(annotated) - 1)
-        resolved[start:end] = rows[start:end][annotated[following]]
+        if len(annotated):
+            following = np.searchsorted(annotated, np.arange(end - start)).clip(max=len(annotated) - 1)
+            resolved[start:end] = rows[start:end][annotated[following]]
     return resolved
-
-
-def numbered(table: FrameTable) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Return the distinct subgoals, and for each level their rows (N,) int32, -1 for none."""
-    unique = sorted({text for values in table.subgoals.values() for text in values if text})
-    number = {text: row for row, text in enumerate(unique)}
-    rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
-    return unique, {level: np.array(found, np.int32) for level, found in rows.items()}
-
-
-def numbered_memory(memory: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return the distinct oracle memory texts, and the row (N,) int32 of each frame."""
-    memories, rows = np.unique(np.array(memory, dtype=object), return_inverse=True)
-    return memories.tolist(), rows.astype(np.int32)
 
 
 class TextEncoder(Protocol):
@@ -148,8 +127,6 @@ class FrameLookup:
     1,500 episodes of 500 frames with the slots of objects take 0.7 GiB of main memory.
 
     Args:
-        root: folder of the dataset.
-        table: its phases and texts.
         stride: distance between remembered frames.
         texts: encoder of the subgoals; None: they have no embeddings.
         remember: features of remembered frames; None: frames are not remembered.
@@ -157,9 +134,7 @@ class FrameLookup:
         encoded: name in a training sample -> features of the present frame.
 
     Attributes:
-        episodes: (E + 1,) first frame of each episode.
-        phase: (N,) 0 in the prompt.
-        acts: (N,) whether the action of a frame has an effect.
+        episodes, phase, acts: see `FrameTable`.
         runs: first frames of the parts of episodes between holds, and of the holds, and N.
         texts: distinct subgoals.
         text_embeddings: (texts, d_t).
@@ -180,14 +155,19 @@ class FrameLookup:
         self.root, self.stride = root, stride
         self.episodes, self.phase, self.acts = table.episodes, table.phase, table.acts
         self.runs = table.runs(table.held)
-        self.texts, rows = numbered(table)
-        self._subgoal_rows = {level: resolve_subgoals(found, table.episodes) for level, found in rows.items()}
+        self.texts = sorted({text for values in table.subgoals.values() for text in values if text})
+        number = {text: row for row, text in enumerate(self.texts)}
+        rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
+        self._subgoal_rows = {
+            level: _resolve_subgoals(np.array(column, np.int32), table.episodes) for level, column in rows.items()
+        }
         width = 0 if texts is None else texts.dim
         self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0, width)
         self.memories: list[str] = []
         self._memory_rows: np.ndarray | None = None
         if table.memory is not None:
-            self.memories, self._memory_rows = numbered_memory(table.memory)
+            memories, self._memory_rows = np.unique(np.array(table.memory, dtype=object), return_inverse=True)
+            self.memories = memories.tolist()
         self.columns: Columns = columns or {}
         self.encoded: Mapping[str, Encoded] = encoded or {}
         self._remember = remember
@@ -264,7 +244,7 @@ class FrameLookup:
 def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], FrameTable]:
     """Read columns of numbers, each (N, ...), and phases and texts of a dataset.
 
-    Objects are read under the observation's name, whichever column of the dataset holds them.
+    `OBJECTS` names the objects, whichever column of the dataset holds them.
 
     Raises:
         MemobenchError: a column is missing, or frames are not numbered 0, 1, 2, ...
@@ -273,19 +253,18 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
     columns: dict[str, np.ndarray] = {}
     wanted = {"index", *names} | ({PRIVILEGED} if OBJECTS in names else set())
     for _, part in tables_of(root / "data", wanted.__contains__):
-        there = part.column_names
-        column_of = {name: objects_column(there) if name == OBJECTS else name for name in names}
-        missing = [name for name in column_of.values() if name not in there]
+        column_of = {name: objects_column(part.column_names) if name == OBJECTS else name for name in names}
+        missing = [name for name in column_of.values() if name not in part.column_names]
         if missing:
             raise MemobenchError(
                 f"The dataset {root} has no column '{missing[0]}', which this policy learns from; generate it again "
                 "with this version, or train with --policy.perception=pixels and no --policy.detection_noise."
             )
-        places = part.column("index").to_numpy()
-        for name, given in column_of.items():
-            values = numbers(part.column(given))
+        index = part.column("index").to_numpy()
+        for name, stored in column_of.items():
+            values = numbers(part.column(stored))
             column = columns.setdefault(name, np.empty((len(table.phase), *values.shape[1:]), values.dtype))
-            column[places] = values
+            column[index] = values
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
 
 
@@ -320,16 +299,16 @@ class SamplesInMemory(Dataset[dict[str, Any]]):
 
     def __getitems__(self, rows: Sequence[int]) -> list[dict[str, Any]]:
         """Return the samples of several rows, each column read once."""
-        at = torch.tensor(rows)
-        found: dict[str, Any] = {name: column[at] for name, column in self._columns.items() if name not in self._steps}
-        after = torch.searchsorted(self._bounds, at, right=True)
-        first, end = self._bounds[after - 1, None], self._bounds[after, None]
+        index = torch.tensor(rows)
+        samples = {name: column[index] for name, column in self._columns.items() if name not in self._steps}
+        following = torch.searchsorted(self._bounds, index, right=True)
+        first, end = self._bounds[following - 1, None], self._bounds[following, None]
         for name, steps in self._steps.items():
-            wanted = at[:, None] + steps
-            found[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
+            wanted = index[:, None] + steps
+            samples[f"{name}_is_pad"] = (wanted < first) | (wanted >= end)
             if name in self._columns:
-                found[name] = self._columns[name][wanted.clamp(first, end - 1)]
-        parts: dict[str, Any] = {name: values.unbind() for name, values in found.items()}
+                samples[name] = self._columns[name][wanted.clamp(first, end - 1)]
+        parts: dict[str, Any] = {name: values.unbind() for name, values in samples.items()}
         parts |= {name: values.take(pa.array(rows)).to_pylist() for name, values in self._texts.items()}
-        parts["task"] = [self._tasks[number] for number in found["task_index"].tolist()]
+        parts["task"] = [self._tasks[number] for number in samples["task_index"].tolist()]
         return [dict(zip(parts, values, strict=True)) for values in zip(*parts.values(), strict=True)]

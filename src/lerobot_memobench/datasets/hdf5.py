@@ -36,7 +36,6 @@ from lerobot_memobench.io import (
     refusing,
 )
 from lerobot_memobench.protocol import ACTION_DIM
-from lerobot_memobench.sim.scene_hash import FORMER, check_world
 
 if TYPE_CHECKING:
     import h5py
@@ -65,15 +64,7 @@ def unusable_on_error() -> AbstractContextManager[None]:
 
 @dataclass(frozen=True, eq=False)
 class PublishedDemo:
-    """A checked group without its images.
-
-    Attributes:
-        states: (T, D) float64.
-        actions: (T, 7) float32.
-        metadata: ``meta_data``.
-        model_file: MJCF, or "" where it is missing.
-        image_size: (height, width).
-    """
+    """A checked group without its images: states (T, D), actions (T, 7), ``meta_data``, MJCF ("" if it is missing)."""
 
     group: str
     states: NDArray[np.float64]
@@ -84,7 +75,7 @@ class PublishedDemo:
 
 
 class PublishedFile:
-    """Open a file in the published layout; a context.
+    """A file in the published layout; a context.
 
     Raises:
         Unusable: naming the first difference to the layout. Raised on opening it concerns the file, by `read` a group.
@@ -108,8 +99,8 @@ class PublishedFile:
                 raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
             self._data: h5py.Group = data
             _check_layout(data)
-            self.bddl_name = text_attribute(data, "bddl_file_name", required=True)
-            self.bddl_text = text_attribute(data, "bddl_file_content", required=True)
+            self.bddl_name = _text_attribute(data, "bddl_file_name", required=True)
+            self.bddl_text = _text_attribute(data, "bddl_file_content", required=True)
         except Exception as error:
             self._file.close()
             if isinstance(error, Unusable):
@@ -127,11 +118,11 @@ class PublishedFile:
     @property
     def lacks_its_text(self) -> bool:
         """Whether the task's text is replaced by the name of an open file."""
-        return names_a_file_object(self.bddl_text)
+        return _is_file_object(self.bddl_text)
 
     def attribute(self, name: str) -> str | None:
         """Return a text attribute of ``data``, or None."""
-        return text_attribute(self._data, name)
+        return _text_attribute(self._data, name)
 
     def groups(self) -> list[str]:
         """Return the names of the demonstrations, demo_2 before demo_10."""
@@ -143,17 +134,9 @@ class PublishedFile:
         return int(value) if isinstance(value, int | np.integer) else None
 
     def read(self, group: str) -> PublishedDemo:
-        """Read and check one demonstration, except its pixels.
-
-        Raises:
-            Unusable: naming the first difference to the layout.
-        """
-        try:
+        """Read and check one demonstration, except its pixels."""
+        with refusing(lambda why: Unusable(f"it cannot be read ({why})")):
             return self._read(group)
-        except Unusable:
-            raise
-        except Exception as error:  # h5py raises OSError, KeyError, RuntimeError, ValueError on damaged files
-            raise Unusable(f"it cannot be read ({first_line(error)})") from None
 
     def _read(self, name: str) -> PublishedDemo:
         import h5py
@@ -163,15 +146,13 @@ class PublishedFile:
             raise Unusable(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise Unusable("it is no group demo_<number>")
-        if "success" in group.attrs:
-            check_world(FORMER, "it was written by an earlier version of this package and", Unusable)
-        states = array(group, "states", (None, None), np.float64)
-        actions = array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
+        states = _array(group, "states", (None, None), np.float64)
+        actions = _array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
         if not isinstance(group.get("obs"), h5py.Group):
             raise Unusable("the group 'obs' is missing")
         images = {
-            image: array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
-            for image in image_names(group["obs"]).values()
+            image: _array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
+            for image in _image_names(group["obs"]).values()
         }
         _check_length(group, {"states": states, "actions": actions, **images})
         sizes = {image.shape[1:3] for image in images.values()}
@@ -179,22 +160,20 @@ class PublishedFile:
             raise Unusable(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
         return PublishedDemo(
             group=name,
-            states=finite("states", states[:]),
-            actions=finite("actions", actions[:]).astype(np.float32),
-            metadata=json_object(text_attribute(group, "meta_data", required=True), "meta_data"),
-            model_file=text_attribute(group, "model_file") or "",
+            states=_finite("states", states[:]),
+            actions=_finite("actions", actions[:]).astype(np.float32),
+            metadata=_json_object(_text_attribute(group, "meta_data", required=True), "meta_data"),
+            model_file=_text_attribute(group, "model_file") or "",
             image_size=sizes.pop(),
         )
 
     def images(self, group: str, rows: int = 1, columns: int = 1) -> Iterator[dict[str, NDArray[np.uint8]]]:
         """Yield both cameras' frames, (H, W, 3) uint8, in order; ``FRAMES_PER_READ`` are in memory at a time.
 
-        Args:
-            group: a name of ``groups()``.
-            rows, columns: -1 turns the images upside down, or mirrors them left to right.
+        -1 as ``rows`` or ``columns`` turns the images upside down, or mirrors them left to right.
         """
         obs = self._data[group]["obs"]
-        names = image_names(obs)
+        names = _image_names(obs)
         for start in range(0, len(obs[names["image"]]), FRAMES_PER_READ):
             try:
                 block = {camera: obs[name][start : start + FRAMES_PER_READ] for camera, name in names.items()}
@@ -225,9 +204,9 @@ def _check_own(file: h5py.File) -> None:
     """Refuse a file with content of others: HDF5 would read any file that its external links and arrays name."""
     import h5py
 
-    def outside(name: str, found: Any) -> str | None:
-        is_array = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
-        return name if is_array or isinstance(found, h5py.ExternalLink) else None
+    def outside(name: str, member: Any) -> str | None:
+        is_array = isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)
+        return name if is_array or isinstance(member, h5py.ExternalLink) else None
 
     name = file.visititems_links(outside) or file.visititems(outside)
     if name:
@@ -253,8 +232,7 @@ def _check_layout(data: h5py.Group) -> None:
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:
-    """Raise unless all arrays have ``num_samples`` frames, and at least one."""
-    lengths = {key: len(found) for key, found in arrays.items()}
+    lengths = {key: len(array) for key, array in arrays.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{key} {length}" for key, length in lengths.items())
         raise Unusable(f"its arrays have different lengths: {listed}")
@@ -268,12 +246,12 @@ def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None
         raise Unusable(f"num_samples is {count}, but its arrays have {length} frames")
 
 
-def names_a_file_object(text: str) -> bool:
+def _is_file_object(text: str) -> bool:
     """Return whether a text is Python's representation of an open file, which LIBERO's script stores by mistake."""
     return FILE_OBJECT.fullmatch(text.strip()) is not None
 
 
-def image_names(obs: h5py.Group) -> dict[str, str]:
+def _image_names(obs: h5py.Group) -> dict[str, str]:
     """Return camera to array of a group of observations: the published names, or LIBERO's."""
     published = any(name in obs for name in IMAGE_NAMES.values())
     return LIBERO_NAMES if not published and any(name in obs for name in LIBERO_NAMES.values()) else IMAGE_NAMES
@@ -281,12 +259,11 @@ def image_names(obs: h5py.Group) -> dict[str, str]:
 
 def demo_number(name: str) -> int | None:
     """Return k of a group demo_k, None for other names."""
-    found = re.fullmatch(r"demo_(\d+)", name)
-    return int(found.group(1)) if found else None
+    match = re.fullmatch(r"demo_(\d+)", name)
+    return int(match.group(1)) if match else None
 
 
-def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
-    """Return a text attribute, or None where it is missing and not required."""
+def _text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     value = _plain(group.attrs.get(key))
     if value is None and required:
         raise Unusable(f"the attribute {key!r} is missing")
@@ -295,9 +272,8 @@ def text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     return value
 
 
-def json_object(text: str, name: str) -> dict[str, Any]:
-    """Return the JSON object in ``text``; ``name`` is its name in messages."""
-    if names_a_file_object(text):
+def _json_object(text: str, name: str) -> dict[str, Any]:
+    if _is_file_object(text):
         raise Unusable(f"{name} holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
         value = parsed(text)
@@ -308,31 +284,29 @@ def json_object(text: str, name: str) -> dict[str, Any]:
     return value
 
 
-def array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
-    """Return an array of one of the types; None in ``shape`` accepts any length."""
+def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
     import h5py
 
-    found = group.get(name)
-    if not isinstance(found, h5py.Dataset):
+    array = group.get(name)
+    if not isinstance(array, h5py.Dataset):
         raise Unusable(f"the array {name!r} is missing")
-    if found.dtype not in [np.dtype(dtype) for dtype in dtypes]:
+    if array.dtype not in [np.dtype(dtype) for dtype in dtypes]:
         expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
-        raise Unusable(f"{name} has type {found.dtype}, expected {expected}")
-    if len(found.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):
+        raise Unusable(f"{name} has type {array.dtype}, expected {expected}")
+    if len(array.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         expected = ", ".join("any" if n is None else str(n) for n in shape)
-        raise Unusable(f"{name} has shape {found.shape}, expected ({expected})")
-    stored = found.id.get_create_plist()
+        raise Unusable(f"{name} has shape {array.shape}, expected ({expected})")
+    stored = array.id.get_create_plist()
     for number, _, _, label in (stored.get_filter(k) for k in range(stored.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
             raise Unusable(
                 f"{name} is compressed by the HDF5 filter {number} {label.decode(errors='replace')!r}, which is not "
                 "installed; set HDF5_PLUGIN_PATH to the folder of its plugin, or rewrite it with `h5repack -f NONE`"
             )
-    return found
+    return array
 
 
-def finite(name: str, values: NDArray) -> NDArray:
-    """Return (T, n) numbers after checking that all are finite and below `LARGEST`."""
+def _finite(name: str, values: NDArray) -> NDArray:
     bad = np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))
     if bad.size:
         raise Unusable(f"{name} holds a value at frame {bad[0]} that is not finite or beyond {LARGEST:g}")

@@ -56,16 +56,16 @@ UNKNOWN = "tasks"
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
-    Raises:
-        Unusable: the group contradicts itself or the task, or is of another scene than the task's.
+    `Unusable` if the group contradicts itself or the task, or is of another scene than the task's.
     """
     sim = _simulation(task)
-    states, fixture_poses = place(sim, compile_scene(demo.model_file), demo.states)
-    exec_start = execution_start(task, demo)
+    states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
+    exec_start = _execution_start(task, demo)
     _check_clock(demo.states, exec_start)
-    frames = key_frames(task, demo, exec_start)
+    frames = _key_frames(task, demo, exec_start)
     evaluate = not frames or min(frames) < 0
-    columns = _read_states(sim, task, states, fixture_poses, exec_start, evaluate)
+    proprio, objects, satisfied, success = _read_states(sim, task, states, fixture_poses, exec_start, evaluate)
+    known = np.arange(len(states))[:, None] >= np.array(frames)  # from the key frame on if it is known
     try:
         return Demonstration(
             task=task,
@@ -74,27 +74,21 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
             variant=0,
             states=states,
             actions=demo.actions,
-            proprio=columns.proprio,
+            proprio=proprio,
             images=None,
             exec_start=exec_start,
-            satisfied=_known_or_evaluated(frames, columns.satisfied),
-            success=columns.success or not evaluate,
+            satisfied=np.where(np.array(frames, dtype=int) >= 0, known, satisfied),
+            success=success or not evaluate,
             fixture_poses=fixture_poses,
             scene_hash="",
             stand_ins=sim.stand_ins,
-            objects=columns.objects,
+            objects=objects,
         )
     except MemobenchError as error:
         raise Unusable(str(error)) from None
 
 
-def _known_or_evaluated(frames: list[int], satisfied: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the (T, K) truth: from the key frame on if it is known, else as evaluated on the states."""
-    known = np.arange(len(satisfied))[:, None] >= np.array(frames)
-    return np.where(np.array(frames, dtype=int) >= 0, known, satisfied)
-
-
-def execution_start(task: Task, demo: PublishedDemo) -> int:
+def _execution_start(task: Task, demo: PublishedDemo) -> int:
     """Return the frame at which execution starts.
 
     If ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without demonstration prompt, else the last frame
@@ -120,8 +114,7 @@ def execution_start(task: Task, demo: PublishedDemo) -> int:
     )
 
 
-def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
-    """Return the checked ``key_frame``, one per checkpoint, -1 where unknown."""
+def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     frames = demo.metadata.get("key_frame", [-1] * len(task.checkpoints))
     if (
         not isinstance(frames, list)
@@ -137,16 +130,6 @@ def key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     return frames
 
 
-@dataclass(frozen=True)
-class StateColumns:
-    """Columns computed from states: proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K), success."""
-
-    proprio: NDArray[np.float32]
-    objects: NDArray[np.float32]
-    satisfied: NDArray[np.bool_]
-    success: bool
-
-
 def _read_states(
     sim: Simulation,
     task: Task,
@@ -154,8 +137,11 @@ def _read_states(
     fixture_poses: dict[str, Pose],
     exec_start: int,
     evaluate: bool,
-) -> StateColumns:
-    """Set the states in the simulator in order and read columns; ``evaluate``: whether to evaluate the formulas."""
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], bool]:
+    """Return proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K) and success at states set in order.
+
+    The last two are false if ``evaluate`` is.
+    """
     goals = [task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)]
     evaluator = Evaluator(goals, HOLD_STEPS // UPSTREAM_EVALUATIONS)
     look = ObjectSlots(sim)
@@ -171,7 +157,7 @@ def _read_states(
         if evaluate and frame > exec_start:  # the world is evaluated after a control step, see Demonstration
             goal, *satisfied[frame] = evaluator.step(sim.holds)
             success = success or goal
-    return StateColumns(np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success)
+    return np.array(proprio, dtype=np.float32), np.array(objects), satisfied, success
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
@@ -196,7 +182,7 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
-    """Return a task's simulation; the last one is cached, because a file's demonstrations follow each other."""
+    # The last one is cached, because a file's demonstrations follow each other.
     try:
         sim = Simulation(task)
     except MemobenchError as error:
@@ -219,13 +205,10 @@ SIDE = 32
 def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
     """Return which of `ORIENTATIONS` the first pictures of a checked group have, by those drawn of its first state.
 
-    None if none is near, or two are.
-
-    Raises:
-        Unusable: the group has no task, or is of another scene than the task's.
+    None if none is near, or two are. `Unusable` if the group has no task, or is of another scene than the task's.
     """
     sim = _simulation(task_of(file, demo))
-    states, fixture_poses = place(sim, compile_scene(demo.model_file), demo.states)
+    states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
     sim.set_state(states[0], fixture_poses)
     stored = next(file.images(demo.group)).items()
     pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
@@ -271,43 +254,33 @@ class Joint:
 
 def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
     """Return a model's joints by name, in the order of its states."""
-    found = {}
+    joints = {}
     for index in range(model.njnt):
         joint = model.joint(index)
         kind = JOINT_TYPES[int(joint.type[0])]
-        at, speed = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
-        wide, fast = WIDTHS[kind]
+        position, velocity = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
+        nq, nv = WIDTHS[kind]
         body = model.body(int(joint.bodyid[0])).name
-        found[joint.name] = Joint(kind, body, slice(at, at + wide), slice(speed, speed + fast))
-    return found
-
-
-def parse_scene(text: str) -> ElementTree.Element:
-    """Return the root of an MJCF text.
-
-    Raises:
-        Unusable: it is missing, or no XML.
-    """
-    if not text.strip():
-        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is unknown")
-    try:
-        return ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise Unusable(f"model_file is no XML ({error})") from None
+        joints[joint.name] = Joint(kind, body, slice(position, position + nq), slice(velocity, velocity + nv))
+    return joints
 
 
 def compile_scene(text: str) -> mujoco.MjModel:
-    """Return the bodies and joints of a model file, compiled with placeholder inertias.
-
-    Raises:
-        Unusable: the text is no scene, or a place in it cannot be read.
-    """
-    root = parse_scene(text)
+    """Return the bodies and joints of a model file, compiled with placeholder inertias, or raise `Unusable`."""
+    if not text.strip():
+        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is unknown")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise Unusable(f"model_file is no XML ({error})") from None
     world = root.find("worldbody")
     if root.tag != "mujoco" or world is None:
         raise Unusable("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
     scene = ElementTree.Element("mujoco")
-    ElementTree.SubElement(scene, "compiler", {"inertiafromgeom": "false", "autolimits": "false", **_angles(root)})
+    angles = {"angle": "degree", "eulerseq": "xyz"}
+    for compiler in root.iterfind("compiler"):
+        angles.update((key, value) for key, value in compiler.attrib.items() if key in angles)
+    ElementTree.SubElement(scene, "compiler", {"inertiafromgeom": "false", "autolimits": "false", **angles})
     _copy_bodies(world, ElementTree.SubElement(scene, "worldbody"))
     try:
         model = mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
@@ -320,7 +293,6 @@ def compile_scene(text: str) -> mujoco.MjModel:
 
 
 def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> None:
-    """Copy bodies and joints, with the attributes of `KEPT`."""
     for element in source:
         tag, name = element.tag, element.get("name", "")
         if tag in LEFT_OUT:
@@ -340,50 +312,16 @@ def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> No
             _copy_bodies(element, copy)
 
 
-def _angles(root: ElementTree.Element) -> dict[str, str]:
-    """Return the attributes of a scene's <compiler> that give the unit and order of angles."""
-    angles = {"angle": "degree", "eulerseq": "xyz"}
-    for compiler in root.iterfind("compiler"):
-        angles.update((key, value) for key, value in compiler.attrib.items() if key in angles)
-    return angles
-
-
 def _body_of(scene: mujoco.MjModel, instance: str) -> str:
-    """Return the name of the body of an object or fixture: its own, or with robosuite's suffix ``_main``."""
-    for name in (f"{instance}_main", instance):
+    for name in (f"{instance}_main", instance):  # the suffix is robosuite's
         if mujoco.mj_name2id(scene, mujoco.mjtObj.mjOBJ_BODY, name) >= 0:
             return name
     raise Unusable(f"model_file has no body {instance!r}, which its task has")
 
 
-def place(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple[States, dict[str, Pose]]:
-    """Return states (T, D) of a model file's scene as states of a simulation's, and the poses of its fixtures.
-
-    Raises:
-        Unusable: the scene lacks a joint or a body, has one beyond the task, or is another one.
-    """
-    theirs, ours = joints_of(scene), joints_of(sim.model)
-    _check_joints(sim.task.name, ours, theirs)
-    width = 1 + scene.nq + scene.nv
-    if states.shape[1] != width:
-        raise Unusable(f"states have width {states.shape[1]}, expected {width} of the joints of model_file")
-    expected = np.array(sim.model.body(BASE).pos)
-    found = np.array(scene.body(_body_of(scene, BASE)).pos)
-    if np.abs(expected - found).max() > BASE_TOLERANCE:
-        raise Unusable(
-            f"model_file has the arm's base {BASE!r} at {found.round(3).tolist()}, expected "
-            f"{expected.round(3).tolist()}: it is of another scene than the benchmark's"
-        )
-    placed = np.zeros((len(states), sim.state_dim))
-    placed[:, 0] = states[:, 0]
-    for name, joint in ours.items():
-        placed[:, joint.position] = states[:, theirs[name].position]
-        placed[:, joint.velocity] = states[:, theirs[name].velocity]
-    return placed, {name: _fixture_pose(scene, name) for name in sim.fixture_poses()}
-
-
-def _check_joints(task_name: str, ours: dict[str, Joint], theirs: dict[str, Joint]) -> None:
-    """Raise unless both scenes have the same joints, in any order."""
+def _translated(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple[States, dict[str, Pose]]:
+    """Return states (T, D) of a model file's scene as states of a simulation's, and the poses of its fixtures."""
+    theirs, ours, task_name = joints_of(scene), joints_of(sim.model), sim.task.name
     for name, joint in ours.items():
         if name not in theirs:
             raise Unusable(f"model_file has no joint {name!r}, which task {task_name} has")
@@ -395,6 +333,22 @@ def _check_joints(task_name: str, ours: dict[str, Joint], theirs: dict[str, Join
             f"model_file moves the body {theirs[beyond].body!r} by the joint {beyond!r}, which task {task_name} does "
             "not have"
         )
+    width = 1 + scene.nq + scene.nv
+    if states.shape[1] != width:
+        raise Unusable(f"states have width {states.shape[1]}, expected {width} of the joints of model_file")
+    expected = np.array(sim.model.body(BASE).pos)
+    base = np.array(scene.body(_body_of(scene, BASE)).pos)
+    if np.abs(expected - base).max() > BASE_TOLERANCE:
+        raise Unusable(
+            f"model_file has the arm's base {BASE!r} at {base.round(3).tolist()}, expected "
+            f"{expected.round(3).tolist()}: it is of another scene than the benchmark's"
+        )
+    translated = np.zeros((len(states), sim.state_dim))
+    translated[:, 0] = states[:, 0]
+    for name, joint in ours.items():
+        translated[:, joint.position] = states[:, theirs[name].position]
+        translated[:, joint.velocity] = states[:, theirs[name].velocity]
+    return translated, {name: _fixture_pose(scene, name) for name in sim.fixture_poses()}
 
 
 def _fixture_pose(scene: mujoco.MjModel, name: str) -> Pose:
@@ -412,38 +366,38 @@ def _fixture_pose(scene: mujoco.MjModel, name: str) -> Pose:
 
 
 def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
-    """Return the task that a demonstration shows, from the file's own BDDL and metadata.
-
-    Raises:
-        Unusable: they do not make a task, or its name or memory type names no folder.
-    """
-    name = _folder_name(task_name(file), "the task's name")
+    """Return the task that a demonstration shows, from the file's own BDDL and metadata, or raise `Unusable`."""
+    path = PurePosixPath(file.bddl_name.replace("\\", "/"))
+    name = file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
+    if path.name == BDDL_FILE and path.parent.name not in ("", "..", "."):
+        name = path.parent.name
+    elif path.stem not in ("", "..", "task_config"):
+        name = path.stem
+    name, known = _folder_name(name, "the task's name"), None
+    if name in task_names(suite=None):
+        known = get_task(name)
     metadata = dict(demo.metadata)
     # The frames differ between demonstrations, the task must not: its scene is compiled once.
     goals = metadata.get("subtask_goals")
     metadata["key_frame"] = [-1] * len(goals) if isinstance(goals, list) else []
     metadata["timestep_exec_start_idx"] = -1
-    memory_type = _folder_name(file.attribute("memory_type") or _memory_type(name, file) or UNKNOWN, "memory_type")
-    task = _load(name, memory_type, _bddl_text(file, name), json.dumps(metadata, sort_keys=True))
-    if name in task_names(suite=None):
-        known = get_task(name)
-        if "family" not in metadata:
-            task = replace(task, family=known.family)
-        if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
-            task = known
-    return task
-
-
-def _bddl_text(file: PublishedFile, name: str) -> str:
-    """Return the task's BDDL: the file's, or the catalogue's if the file stores the name of an open file instead."""
-    if not file.lacks_its_text:
-        return file.bddl_text
-    if name not in task_names(suite=None):
-        raise Unusable(
-            f"bddl_file_content holds {file.bddl_text[:60]!r}, the name of a Python object instead of the task's text, "
-            f"and the catalogue has no task {name!r}; write the text into it"
-        )
-    return get_task(name).bddl_text
+    folders = reversed([*path.parts, *file.path.resolve().parts])
+    stated = known.memory_type if known else next((folder for folder in folders if folder in MEMORY_TYPES), UNKNOWN)
+    memory_type = _folder_name(file.attribute("memory_type") or stated, "memory_type")
+    bddl_text = file.bddl_text
+    if file.lacks_its_text:  # the file stores the name of an open file instead
+        if known is None:
+            raise Unusable(
+                f"bddl_file_content holds {bddl_text[:60]!r}, the name of a Python object instead of the task's text, "
+                f"and the catalogue has no task {name!r}; write the text into it"
+            )
+        bddl_text = known.bddl_text
+    task = _load(name, memory_type, bddl_text, json.dumps(metadata, sort_keys=True))
+    if known is None:
+        return task
+    if (task.bddl_text, task.metadata) == (known.bddl_text, known.metadata):
+        return known
+    return task if "family" in metadata else replace(task, family=known.family)
 
 
 def unlike_the_catalogue(task: Task) -> str | None:
@@ -468,28 +422,11 @@ def unlike_the_catalogue(task: Task) -> str | None:
     )
 
 
-def task_name(file: PublishedFile) -> str:
-    """Return the task's name: the folder of ``bddl_file_name``, or its stem, or the HDF5 file's."""
-    path = PurePosixPath(file.bddl_name.replace("\\", "/"))
-    if path.name == BDDL_FILE and path.parent.name not in ("", "..", "."):
-        return path.parent.name
-    if path.stem not in ("", "..", "task_config"):
-        return path.stem
-    return file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
-
-
 def _folder_name(text: str, role: str) -> str:
     try:
         return file_name(text, role)
     except MemobenchError as error:
         raise Unusable(str(error)) from None
-
-
-def _memory_type(name: str, file: PublishedFile) -> str:
-    if name in task_names(suite=None):
-        return get_task(name).memory_type
-    folders = [*PurePosixPath(file.bddl_name.replace("\\", "/")).parts, *file.path.resolve().parts]
-    return next((folder for folder in reversed(folders) if folder in MEMORY_TYPES), "")
 
 
 @lru_cache(maxsize=64)

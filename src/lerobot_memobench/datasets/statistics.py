@@ -12,12 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
-from lerobot_memobench.datasets.images import frame_reader
-from lerobot_memobench.datasets.lerobot_format.assembling import numeric_stats
-from lerobot_memobench.datasets.lerobot_format.layout import ADVICE, STATS_FILE
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
-from lerobot_memobench.datasets.video import ImageHistograms, Stats
+from lerobot_memobench.datasets.layout import ADVICE, STATS_FILE
+from lerobot_memobench.datasets.video import ImageHistograms, Stats, frame_reader
+from lerobot_memobench.datasets.write import numeric_stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, read_json, short, write_file
 from lerobot_memobench.protocol import CLOCK
@@ -48,46 +47,40 @@ def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def compute(folder: Path, names: Iterable[str]) -> dict[str, Stats]:
     """Compute the statistics of a dataset's features: exact for numbers, over LeRobot's sample of frames for images.
 
-    Held frames do not count for numbers: nothing is learned from them, and they may be most frames.
+    Held frames do not count for numbers, as in `write`.
 
     Raises:
         MemobenchError: a column is missing or damaged.
     """
-    features, chosen = read_info(folder)["features"], list(names)
-    cameras = [name for name in chosen if features[name]["dtype"] in IMAGES]
-    numbers = [name for name in chosen if name not in cameras]
-    columns, table = read_recorded(folder, numbers)
-    found = {name: numeric_stats(column.numpy()[~table.held]) for name, column in columns.items()}
-    return found | {camera: _image_stats(folder, camera) for camera in cameras}
+    features, names = read_info(folder)["features"], list(names)
+    cameras = [name for name in names if features[name]["dtype"] in IMAGES]
+    columns, table = read_recorded(folder, [name for name in names if name not in cameras])
+    stats = {name: numeric_stats(column.numpy()[~table.held]) for name, column in columns.items()}
+    return stats | {camera: _image_stats(folder, camera) for camera in cameras}
 
 
 def _image_stats(folder: Path, camera: str) -> Stats:
     from lerobot.datasets.compute_stats import aggregate_stats, sample_indices
 
-    read, found = frame_reader(folder, camera), []
+    read, episodes = frame_reader(folder, camera), []
     for episode, length in enumerate(np.diff(read_frame_table(folder).episodes).tolist()):
-        seen = ImageHistograms()
+        histograms = ImageHistograms()
         sampled = sample_indices(length)
         for first in range(0, len(sampled), BLOCK):
             images = read(episode, sampled[first : first + BLOCK])
             for image in (images * 255).round().byte().permute(0, 2, 3, 1).numpy():
-                seen.add(np.ascontiguousarray(image))
-        found.append({camera: seen.stats(sampled=True)})
-    stats: Stats = aggregate_stats(found)[camera]
+                histograms.add(np.ascontiguousarray(image))
+        episodes.append({camera: histograms.stats(sampled=True)})
+    stats: Stats = aggregate_stats(episodes)[camera]
     return stats
 
 
 def recorded(folder: Path) -> dict[str, dict[str, Any]]:
-    """Return ``meta/stats.json``; empty where there is none.
-
-    Raises:
-        MemobenchError: it cannot be read.
-    """
-    try:
-        found: dict[str, dict[str, Any]] = read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
-    except FileNotFoundError:
-        return {}
-    return found
+    """Return ``meta/stats.json``; empty where there is none."""
+    stats: dict[str, dict[str, Any]] = {}
+    if (folder / STATS_FILE).exists():
+        stats = read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
+    return stats
 
 
 def check_statistics(folder: Path, names: Iterable[str]) -> None:
@@ -106,32 +99,29 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
         for key, value in stats.items():
             bounded = key.startswith("q") or (is_image and key != "mean" and key != "std")
             least, most = (low, high) if bounded else (value.ravel(), value.ravel())
-            there = kept.get(name, {}).get(key)
-            if not (is_image and key == "count") and not _within(there, value.size, least - slack, most + slack):
+            stored = kept.get(name, {}).get(key)
+            if not (is_image and key == "count") and not _within(stored, value.size, least - slack, most + slack):
                 raise MemobenchError(
-                    f"{key} of {name} is {short(there)}, expected {short(value.tolist())} of the frames; {ADVICE}"
+                    f"{key} of {name} is {short(stored)}, expected {short(value.tolist())} of the frames; {ADVICE}"
                 )
 
 
-def _within(there: Any, size: int, least: Any, most: Any) -> bool:
+def _within(stored: Any, size: int, least: Any, most: Any) -> bool:
     try:
-        found = np.asarray(there, dtype=np.float64).ravel()
+        numbers = np.asarray(stored, dtype=np.float64).ravel()
     except (TypeError, ValueError):
         return False
-    return found.size == size and bool(((least <= found) & (found <= most)).all())
+    return numbers.size == size and bool(((least <= numbers) & (numbers <= most)).all())
 
 
 def needed_by(policy: Any, features: Mapping[str, Mapping[str, Any]], imagenet: bool) -> dict[str, Collection[str]]:
-    """Return feature -> names of the statistics by which a training normalises it.
+    """Return feature -> names of the statistics by which a training with the configuration ``policy`` normalises it.
 
-    Args:
-        policy: configuration of the policy.
-        features: features of the dataset.
-        imagenet: whether LeRobot replaces the statistics of images, which must exist, by ImageNet's.
+    ``imagenet``: whether LeRobot replaces the statistics of images, which must exist, by ImageNet's.
     """
     from lerobot.utils.feature_utils import dataset_to_policy_features
 
-    found: dict[str, Collection[str]] = {}
+    needed: dict[str, Collection[str]] = {}
     for name, feature in dataset_to_policy_features(dict(features)).items():
         mode = policy.normalization_mapping.get(feature.type.value)
         keys = NEEDED.get(getattr(mode, "value", mode), ())
@@ -139,30 +129,25 @@ def needed_by(policy: Any, features: Mapping[str, Mapping[str, Any]], imagenet: 
             keys = (*keys, "mean", "std")
         depth = features[name]["dtype"] in IMAGES and 3 not in features[name]["shape"]
         if keys and name not in CLOCK and not depth:
-            found[name] = keys
-    return found
+            needed[name] = keys
+    return needed
 
 
 def lacking(folder: Path, needed: Mapping[str, Collection[str]]) -> list[str]:
     """Return the features of a dataset that lack one of the ``needed`` statistics."""
-    there = recorded(folder)
-    return [name for name, keys in needed.items() if set(keys) - set(there.get(name, {}))]
+    stats = recorded(folder)
+    return [name for name, keys in needed.items() if set(keys) - set(stats.get(name, {}))]
 
 
 def complete(folder: Path, names: Sequence[str], notify: Callable[[str], None]) -> None:
-    """Compute the statistics of a dataset's features and add missing ones to its ``meta/stats.json``.
-
-    Args:
-        folder: the dataset.
-        names: features that lack statistics.
-        notify: called with their names before they are computed.
+    """Compute the statistics of features that lack some, and add those to a dataset's ``meta/stats.json``.
 
     Raises:
         MemobenchError: a column is missing or damaged, or the folder cannot be written.
     """
     notify(f"computing and adding statistics that {folder / STATS_FILE} lacks: {', '.join(names)}")
-    there = recorded(folder)
+    kept = recorded(folder)
     for name, stats in compute(folder, names).items():
-        there[name] = {key: value.tolist() for key, value in stats.items()} | there.get(name, {})
+        kept[name] = {key: value.tolist() for key, value in stats.items()} | kept.get(name, {})
     with explaining_disk_errors(folder):
-        write_file(folder / STATS_FILE, json.dumps(there, indent=4))
+        write_file(folder / STATS_FILE, json.dumps(kept, indent=4))

@@ -8,7 +8,7 @@ must be near to the decoded ones.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -19,37 +19,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
-from lerobot_memobench.datasets.images import FrameReader, frame_reader
-from lerobot_memobench.datasets.lerobot_format.columns import (
-    EXECUTED_ACTION,
-    LANGUAGE,
-    OBJECTS,
-    check_clock,
-    image_key,
-    objects_column,
+from lerobot_memobench.datasets.episodes import (
+    Columns,
+    DemonstrationRecord,
+    FileHash,
+    RecordedEpisode,
+    check_whole,
+    expect,
+    list_episodes,
+    read_episode,
+    read_info,
+    read_manifest,
+    read_table,
+    read_to_end,
 )
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole, expect, read_to_end
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.layout import (
     ADVICE,
     EPISODES,
+    EXECUTED_ACTION,
     INFO_FILE,
+    LANGUAGE,
     MANIFEST_FILE,
     STATS_FILE,
     dataset_files,
+    image_key,
     is_dataset,
+    objects_column,
 )
-from lerobot_memobench.datasets.lerobot_format.manifest import Written, read_manifest
-from lerobot_memobench.datasets.lerobot_format.reading import (
-    Columns,
-    EpisodePlace,
-    RecordedEpisode,
-    check_revision,
-    list_episodes,
-    read_episode,
-)
-from lerobot_memobench.datasets.lerobot_format.record import EpisodeRecord
-from lerobot_memobench.datasets.lerobot_format.tables import read_info, read_table
 from lerobot_memobench.datasets.statistics import check_statistics, measured
+from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
@@ -57,9 +55,7 @@ from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.scene_hash import check_world
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -67,21 +63,14 @@ from lerobot_memobench.tasks.task import STRICT, Task
 COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
 """Fields of an episode in the manifest that its record has too."""
 NO_HASHES = (
-    "it has no hashes of files, as in datasets of earlier versions and after LeRobot's dataset tools: damage to a "
-    "frame that can still be decoded and is not drawn again cannot be found"
+    "it has no hashes of files, as after LeRobot's dataset tools: damage to a frame that can still be decoded and is "
+    "not drawn again cannot be found"
 )
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Outcome of the check of an episode or a file.
-
-    Attributes:
-        subject: ``episode 3``, or a file.
-        disagreement: the first disagreement, None if everything agrees.
-        note: remark on a file that agrees.
-        of_file: whether the subject is a file.
-    """
+class CheckResult:
+    """First disagreement of an episode or a file, None if everything agrees, and a note on a file that agrees."""
 
     subject: str
     disagreement: str | None
@@ -91,51 +80,39 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Check:
-    """A check of an episode, of a file, or of its agreement with others; runs in any process.
-
-    ``check`` returns a disagreement of an episode, or a note on a file, or None, and raises for damage.
-    """
+    """A check, which returns a disagreement of an episode, or a note on a file, or None, and raises for damage."""
 
     subject: str
     path: Path
     of_file: bool
     check: Callable[[], str | None]
 
-    def run(self) -> Verdict:
-        """Run the check."""
+    def run(self) -> CheckResult:
         try:
             with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.path):
-                found = self.check()
+                message = self.check()
         except MemobenchError as error:  # the other checks still run
-            return Verdict(self.subject, str(error), of_file=self.of_file)
-        return Verdict(self.subject, None, found, of_file=True) if self.of_file else Verdict(self.subject, found)
-
-
-ValidationProgress = Callable[[int, int, Verdict], None]
-"""Called with the number of finished checks, their total, and the latest verdict."""
+            return CheckResult(self.subject, str(error), of_file=self.of_file)
+        disagreement, note = (None, message) if self.of_file else (message, None)
+        return CheckResult(self.subject, disagreement, note, self.of_file)
 
 
 def validate(
     folder: Path | str,
     *,
     workers: int = 1,
-    tasks: Mapping[str, Task] | None = None,
-    progress: ValidationProgress | None = None,
-) -> list[Verdict]:
+    progress: Callable[[int, int, CheckResult], None] = lambda *_: None,
+) -> list[CheckResult]:
     """Replay the episodes of a dataset and check its files.
 
     States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
     scene must be equal; some frames of each camera must be near to those of the simulator. Every file is read to its
     end and compared with its hash, statistics with those of the frames, and the manifest with the episodes.
 
-    Args:
-        folder: folder of the dataset.
-        workers: number of processes.
-        tasks: name to task, for tasks that are not in the catalogue.
-        progress: called after each check.
+    ``progress`` is called after each check with the number of finished checks, their total, and the latest result.
 
     Returns:
-        A verdict for each episode, in order, then one for each file with a disagreement or a note.
+        The result of each episode, in order, then of each file with a disagreement or a note.
 
     Raises:
         MemobenchError: there is no dataset.
@@ -143,24 +120,31 @@ def validate(
     folder = Path(folder).absolute()
     if workers < 1:
         raise MemobenchError(f"{workers} workers were asked for; it must be at least 1")
-    checks = [*_episode_checks(folder, tasks), *_file_checks(folder)]
-    verdicts: dict[int, Verdict] = {}
+    if not is_dataset(folder):
+        raise MemobenchError(
+            f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
+            "by `memobench convert`"
+        )
+    checks = [
+        _Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k)) for k in range(episode_count(folder))
+    ]
+    checks += _file_checks(folder)
+    results: dict[int, CheckResult] = {}
 
-    def note(number: int, verdict: Verdict) -> None:
-        verdicts[number] = verdict
-        if progress is not None:
-            progress(len(verdicts), len(checks), verdict)
+    def add(number: int, result: CheckResult) -> None:
+        results[number] = result
+        progress(len(results), len(checks), result)
 
-    if workers == 1 or len(checks) == 1:
+    if workers == 1:
         for number, check in enumerate(checks):
-            note(number, check.run())
+            add(number, check.run())
     else:
         with process_pool(min(workers, len(checks))) as pool:
             futures = {pool.submit(check.run): number for number, check in enumerate(checks)}
             for future in as_completed(futures):
-                note(futures[future], future.result())
-    found = [verdicts[number] for number in range(len(checks))]
-    return [verdict for verdict in found if not verdict.of_file or verdict.disagreement or verdict.note]
+                add(futures[future], future.result())
+    in_order = [results[number] for number in range(len(checks))]
+    return [result for result in in_order if not result.of_file or result.disagreement or result.note]
 
 
 def images_of(folder: Path, episode: int) -> Images | None:
@@ -171,10 +155,10 @@ def images_of(folder: Path, episode: int) -> Images | None:
     cameras = {camera: key for camera, name in CONVENTIONS[convention].items() if (key := image_key(name)) in features}
 
     def read(frames: Sequence[int]) -> dict[str, NDArray[np.uint8]]:
-        found = {camera: _reader(folder, key)(episode, list(frames)) for camera, key in cameras.items()}
+        decoded = {camera: _reader(folder, key)(episode, list(frames)) for camera, key in cameras.items()}
         return {
-            camera: (shown * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()[:, :, ::step]
-            for camera, shown in found.items()
+            camera: (images * 255).round().clamp(0, 255).byte().permute(0, 2, 3, 1).numpy()[:, :, ::step]
+            for camera, images in decoded.items()
         }
 
     return read if cameras else None
@@ -185,23 +169,16 @@ def _reader(folder: Path, camera: str) -> FrameReader:
     return frame_reader(folder, camera)
 
 
-def exit_status(verdicts: Sequence[Verdict]) -> int:
-    """Return 0 if everything agrees, else 1."""
-    return 1 if any(verdict.disagreement is not None for verdict in verdicts) else 0
-
-
 def _file_checks(folder: Path) -> Iterator[_Check]:
-    """Yield the checks of each file of a dataset, and of the agreement between files."""
-
     def of(name: Path | str, check: Callable[[], str | None]) -> _Check:
         return _Check(Path(name).as_posix(), folder / name, True, check)
 
-    written = None
+    hashes = None
     with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` reports its damage
-        written = read_manifest(folder).get("files")
-    for name in sorted({*dataset_files(folder), *(written or {})}):
-        yield of(name, partial(check_file, folder / name, (written or {}).get(name)))
-    if written is None:
+        hashes = read_manifest(folder).get("files")
+    for name in sorted({*dataset_files(folder), *(hashes or {})}):
+        yield of(name, partial(check_file, folder / name, (hashes or {}).get(name)))
+    if hashes is None:
         yield of(MANIFEST_FILE, partial(str, NO_HASHES))
     yield of(INFO_FILE, partial(check_whole, folder))
     yield of(INFO_FILE, partial(check_description, folder))
@@ -213,39 +190,19 @@ def _file_checks(folder: Path) -> Iterator[_Check]:
         yield of(MANIFEST_FILE, partial(check_manifest, folder))
 
 
-def _episode_checks(folder: Path, tasks: Mapping[str, Task] | None) -> list[_Check]:
-    if not is_dataset(folder):
-        raise MemobenchError(
-            f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
-            "by `memobench convert`"
-        )
-    check_clock(read_info(folder)["features"], folder)
-    places: Sequence[EpisodePlace] = ()
-    with contextlib.suppress(MemobenchError):  # the check of each episode reports a damaged file
-        places = list_episodes(folder)
-    check_revision(folder, places)
-    count = episode_count(folder)
-    return [_Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k, tasks)) for k in range(count)]
-
-
-def _replay_episode(folder: Path, index: int, tasks: Mapping[str, Task] | None) -> str | None:
+def _replay_episode(folder: Path, index: int) -> str | None:
     episode = read_episode(folder, index)
     if episode.record.seed < 0:
         return "it has no seed, so its scene cannot be made again"
-    task, images = (tasks or {}).get(episode.record.task_name), images_of(folder, index)
-    found = replay(episode, task=task, images=images)
-    return None if found is None else str(found)
+    difference = replay(episode, images_of(folder, index))
+    return None if difference is None else str(difference)
 
 
 # --- files ---
 
 
 def episode_count(folder: Path) -> int:
-    """Return the number of episodes of the dataset in ``folder``, by ``meta/info.json`` and ``meta/episodes``.
-
-    Raises:
-        MemobenchError: they cannot be read, or disagree.
-    """
+    """Return the number of episodes, on which ``meta/info.json`` and ``meta/episodes`` must agree."""
     count, rows = int(read_info(folder)["total_episodes"]), len(read_table(folder / EPISODES, "episode_index".__eq__))
     if rows != count:
         raise MemobenchError(
@@ -254,7 +211,7 @@ def episode_count(folder: Path) -> int:
     return count
 
 
-def check_file(path: Path, written: Written | None) -> str | None:
+def check_file(path: Path, recorded: FileHash | None) -> str | None:
     """Read a file to its end and compare it with its recorded hash; return a note if it was written again.
 
     Other bytes in a file of equal size are damage; tools that encode or write a file again change its size.
@@ -267,9 +224,9 @@ def check_file(path: Path, written: Written | None) -> str | None:
     check_fetched(path)
     if path.suffix in (".parquet", ".mp4"):
         read_to_end(path)
-    if written is None or file_hash(path) == written["sha256"]:
+    if recorded is None or file_hash(path) == recorded["sha256"]:
         return None
-    if path.stat().st_size == written["bytes"]:
+    if path.stat().st_size == recorded["bytes"]:
         raise MemobenchError(
             f"its size is as in {MANIFEST_FILE}, but its content differs: it was damaged or edited; take the dataset "
             "from its source again, or generate it"
@@ -278,11 +235,7 @@ def check_file(path: Path, written: Written | None) -> str | None:
 
 
 def check_description(folder: Path) -> None:
-    """Compare the features, frame rate and splits of ``meta/info.json`` with the columns and videos.
-
-    Raises:
-        MemobenchError: naming the first difference.
-    """
+    """Compare features, frame rate and splits of ``meta/info.json`` with columns and videos; raise at a difference."""
     import av
     import pyarrow as pa
     import pyarrow.compute as pc
@@ -295,15 +248,15 @@ def check_description(folder: Path) -> None:
     splits = {"train": f"0:{info['total_episodes']}"}
     expect(INFO_FILE, "splits", [info.get("splits", splits)], [splits])
     for path in files_below(folder / "data", ".parquet"):
-        found = {field.name: field.type for field in pq.read_schema(path)}
-        for name, kind in {**dict.fromkeys(found), **wanted}.items():
-            there = found.get(name)
-            if name == LANGUAGE and there is not None:
+        types = {field.name: field.type for field in pq.read_schema(path)}
+        for name, kind in {**dict.fromkeys(types), **wanted}.items():
+            stored = types.get(name)
+            if name == LANGUAGE and stored is not None:
                 continue  # LeRobot's tools write the fields of its rows in several types
-            if isinstance(there, pa.ListType) and isinstance(kind, pa.FixedSizeListType):  # as LeRobot's tools write it
+            if isinstance(stored, pa.ListType) and isinstance(kind, pa.FixedSizeListType):  # by LeRobot's tools
                 (size,) = pc.list_value_length(pq.read_table(path, columns=[name])[name]).unique().to_pylist()
-                there = pa.list_(there.value_type, size)
-            expect(path.relative_to(folder), f"type of the column {name}", [there], [kind])
+                stored = pa.list_(stored.value_type, size)
+            expect(path.relative_to(folder), f"type of the column {name}", [stored], [kind])
     for name, feature in features.items():
         is_video, names = feature["dtype"] == "video", feature.get("names")
         if isinstance(names, list):
@@ -313,23 +266,19 @@ def check_description(folder: Path) -> None:
                 video = container.streams.video[0]
                 sizes = [video.height, video.width, 3, float(video.average_rate or 0)]
             stated = [feature.get("info", {}).get(f"video.{key}") for key in ("height", "width", "channels", "fps")]
-            for there in ([*feature["shape"], info["fps"]], stated):
-                expect(INFO_FILE, f"size and rate of {name}", there, sizes)
+            for values in ([*feature["shape"], info["fps"]], stated):
+                expect(INFO_FILE, f"size and rate of {name}", values, sizes)
 
 
 def check_manifest(folder: Path) -> None:
-    """Compare seeds, hashes and lengths in the manifest of the dataset in ``folder`` with its episodes.
-
-    Raises:
-        MemobenchError: naming the first episode and field that differ.
-    """
-    rows = {row.get("episode_index"): row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
-    for place in list_episodes(folder) if None not in rows else ():  # a manifest of an earlier version
-        row = rows.pop(place.index, {})
-        held = {key: getattr(place.record, key) for key in COMPARED} if place.record is not None else {}
-        for key, value in {"frames": place.length, **held}.items():
-            if row.get(key) != value and value is not None:
-                raise MemobenchError(f"episode {place.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
+    """Compare seeds, hashes and lengths in the manifest with the dataset's episodes; raise at the first difference."""
+    rows = {row["episode_index"]: row for row in read_manifest(folder)["episodes"] if row["failure"] is None}
+    for episode in list_episodes(folder):
+        row, record = rows.pop(episode.index, {}), episode.record
+        facts = {"frames": episode.length} | ({} if record is None else record.model_dump(include={*COMPARED}))
+        for key, value in facts.items():
+            if row.get(key) != value:
+                raise MemobenchError(f"episode {episode.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
     if rows:
         raise MemobenchError(f"it names episode {next(iter(rows))}, which is not in the dataset")
 
@@ -362,53 +311,50 @@ class Disagreement:
         return f"{self.column}{where}: recorded {_text(self.recorded)}, replayed {_text(self.replayed)}"
 
 
-def replay(
-    recorded: Demonstration | RecordedEpisode, *, task: Task | None = None, images: Images | None = None
-) -> Disagreement | None:
+def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreement | None:
     """Replay an episode and return the first disagreement, or None.
 
     Compared are states (if recorded), proprioception, visible objects, instruction, numbering, every label column,
     language rows, success, key frames, and the hashes of scene and episode. The episode's hash covers the states, which
     LeRobot's dataset tools remove.
 
-    Args:
-        recorded: the episode.
-        task: replaces the catalogue's task of the episode's name.
-        images: returns recorded images; some of them are compared.
+    ``images`` returns recorded images; some of them are compared.
 
     Raises:
         MemobenchError: there is no such task, or the actions were removed.
     """
-    if isinstance(recorded, Demonstration):
-        record, task, start = EpisodeRecord.of(recorded), recorded.task, 0
-        wanted, executed, held = recorded.actions, recorded.applied, recorded.held
-        columns, whole = _columns(recorded, OBJECTS), _whole(recorded)
-    else:
-        record, start = recorded.record, recorded.start
-        check_world(record.world, "the episode")
-        task = (task or get_task(record.task_name)).variant(record.variant)
-        columns, whole = recorded.columns, recorded.whole
-        if "action" not in columns:
-            raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
-        wanted, executed = columns["action"], columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"]
-        held = columns.get(HELD_COLUMN)
-    watch = _ImageCheck(record.exec_start_index, len(wanted), images)
-    again = resimulate(task, record.seed, executed, record.exec_start_index, watch, held)
+    record, columns = recorded.record, recorded.columns
+    task = get_task(record.task_name).variant(record.variant)
+    if "action" not in columns:
+        raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
+    actions = columns["action"]
+    executed, held = columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"], columns.get(HELD_COLUMN)
+    image_check = _ImageCheck(record.exec_start_index, len(actions), images)
+    again = resimulate(task, record.seed, executed, record.exec_start_index, image_check, held)
     again = replace(again, referent=record.referent, variant=record.variant)
-    if not np.array_equal(wanted, executed):
-        again = replace(again, actions=wanted, executed=again.actions)
-    found = _whole_difference(whole, _whole(again))
-    if found is not None and found.column == "digest" and again.executed is not None:
-        found = replace(found, column="action or held (they alone are in the episode's hash and not in its states)")
-    frames = np.arange(len(wanted))
-    numbering = {
-        "task": [task.language] * len(wanted),
+    if not np.array_equal(actions, executed):
+        again = replace(again, actions=actions, executed=again.actions)
+    columns_again = labels(again)
+    whole = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
+    of_episode = next(
+        (Disagreement(key, None, old, whole[key]) for key, old in recorded.whole.items() if old != whole[key]), None
+    )
+    if of_episode is not None and of_episode.column == "digest" and again.executed is not None:
+        of_episode = replace(
+            of_episode, column="action or held (they alone are in the episode's hash and not in its states)"
+        )
+    frames = np.arange(len(actions))
+    replayed = {
+        "task": [task.language] * len(actions),
         "frame_index": frames,
-        "index": start + frames,
+        "index": recorded.start + frames,
         "timestamp": (frames / CONTROL_HZ).astype(np.float32),
+        "states": again.states,
+        "observation.state": again.proprio,
+        objects_column(columns): again.objects,
+        **columns_again,
     }
-    replayed = numbering | _columns(again, objects_column(columns))
-    return _first_difference(columns, replayed) or watch.difference or found
+    return _first_difference(columns, replayed) or image_check.difference or of_episode
 
 
 class _ImageCheck:
@@ -453,16 +399,16 @@ def resimulate(
     seed: int,
     actions: NDArray[np.float32],
     exec_start: int,
-    watch: _ImageCheck | None = None,
+    image_check: _ImageCheck | None = None,
     held: NDArray[np.bool_] | None = None,
 ) -> Demonstration:
     """Apply (T, 7) float32 actions in the scene of ``seed``; return the resulting demonstration without images.
 
     At the end of the prompt the scene returns to its start, except for hidden objects: at frame ``exec_start``, or at
-    the first frame of the rest before it, whose action is zeros. ``watch`` compares the images of each frame; ``held``
-    (T,) are the frames after which nothing is simulated.
+    the first frame of the rest before it, whose action is zeros. ``held`` (T,) are the frames after which nothing is
+    simulated.
     """
-    sim = Simulation(task, None if watch is None else watch.settings)
+    sim = Simulation(task, None if image_check is None else image_check.settings)
     sim.reset(seed)
     start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
     progress = Progress(task)
@@ -481,8 +427,8 @@ def resimulate(
         if frame == exec_start and strict:
             progress.settle(sim.holds)
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
-        if watch is not None:
-            watch.compare(sim, frame)
+        if image_check is not None:
+            image_check.compare(sim, frame)
         states.append(sim.state())
         proprio.append(sim.proprio())
         objects.append(objects[-1] if rests and rested else look.observe())
@@ -511,20 +457,6 @@ def resimulate(
     )
 
 
-def _columns(demo: Demonstration, objects: str) -> Columns:
-    """Return states, proprioception and labels by column name; ``objects`` is the column of the objects."""
-    return {
-        "states": demo.states,
-        "observation.state": demo.proprio,
-        objects: demo.objects,
-        **labels(demo).columns(),
-    }
-
-
-def _whole(demo: Demonstration) -> dict[str, Any]:
-    return EpisodeRecord.of(demo).determined() | {LANGUAGE: persistent_rows(labels(demo))}
-
-
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:
     """Return the first difference of a common column by frame, then by order of the columns."""
     first: Disagreement | None = None
@@ -542,13 +474,6 @@ def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | No
         if differs and (first is None or first.frame is None or differs[0] < first.frame):
             first = Disagreement(column, differs[0], old[differs[0]], new[differs[0]])
     return first
-
-
-def _whole_difference(recorded: dict[str, Any], replayed: dict[str, Any]) -> Disagreement | None:
-    for key, old in recorded.items():
-        if old != replayed[key]:
-            return Disagreement(key, None, old, replayed[key])
-    return None
 
 
 def _text(value: Any) -> str:

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lerobot_memobench.envs.pacing import Pacing
-from lerobot_memobench.envs.prompt_cache import Prompt, prompt_file, prompt_of
+from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.blind import blind_routine
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert
+from lerobot_memobench.experts.expert import Expert, blind_routine
 from lerobot_memobench.protocol import (
     ACTION_DIM,
     CAMERAS,
@@ -37,10 +36,14 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.rendering import RenderSettings
-from lerobot_memobench.sim.simulation import InvalidActionError, Simulation, UnstablePhysicsError, as_action
+from lerobot_memobench.sim.simulation import (
+    InvalidActionError,
+    RenderSettings,
+    Simulation,
+    UnstablePhysicsError,
+    as_action,
+)
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.difficulty import Difficulty
 from lerobot_memobench.tasks.evidence import Choice
 from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
@@ -62,10 +65,6 @@ class Episode:
     """An episode of one task; `reset` starts it for a seed.
 
     Args:
-        task: the task of the catalogue.
-        settings: settings of the environment. An episode uses ``referent``, ``demonstration_prompt``, ``horizon``,
-            ``protocol``, ``render``, sizes of pictures, ``corrupt_step``, ``reshow``, ``interference`` and those of
-            `Pacing`. Without the demonstration prompt, objects that it hides are hidden before the first frame.
         render: size and quality of frames; None for those of ``settings``.
         changes: settings by name that replace those of ``settings``.
 
@@ -88,7 +87,7 @@ class Episode:
     ) -> None:
         self.settings = settings = settings.changed(**changes)
         render = render or RenderSettings(settings.observation_height, settings.observation_width, settings.render)
-        self.published = task = task.at(cast("Difficulty", settings.difficulty))
+        self.published = task = task.at(settings.difficulty)
         self.referent = referent_text(settings.referent, task.drawn)
         self._limit = settings.horizon * steps_per_action(settings.speed)
         self.demonstration_prompt = settings.demonstration_prompt and task.prompt is not None
@@ -104,9 +103,8 @@ class Episode:
         """Start the episode of a seed. The episode is a function of task, settings, seed and actions.
 
         Args:
-            seed: seed of the scene.
             variant: variant to run instead of the drawn one (evidence); `choice` then follows the policy's choice.
-            keep_prompt: whether the prompt is cached (`prompt_cache`).
+            keep_prompt: whether the prompt is cached (`prompts`).
         """
         self.seed = int(seed)
         self.fault: Fault | None = None
@@ -122,7 +120,11 @@ class Episode:
             self.sim.reset(self.seed, self.progress.settle)
         else:
             self.progress = Progress(task)
-            self.sim.reset(self.seed, state=self._initial_state())
+            state: NDArray[np.float64] | None = None
+            if self.published.suite in LIBERO_SUITES:
+                states = initial_states(self.published.name)
+                state = states[(self.seed - self.settings.seed_base) % len(states)]  # begin again, as in LeRobot
+            self.sim.reset(self.seed, state=state)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
         self.step_index = 0
@@ -136,7 +138,7 @@ class Episode:
         self._wrong_atoms: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
-        self._prompt: Prompt | None = None
+        self._prompt: PromptPlayer | None = None
         self._reshows = self.settings.reshow
         self.corrupts = self.corrupted = False
         self.waits, self._interrupts = False, self.settings.interference > 0
@@ -144,20 +146,13 @@ class Episode:
         if self.demonstration_prompt or (task.prompt is not None and not task.prompt.restores):
             self._prompt = self._new_prompt()
         if not self.demonstration_prompt:
-            self._hide_objects()
+            # Objects that the prompt hides are hidden although it is not shown.
+            self.skip_prompt_frames()
+            while self._prompt is not None:
+                self._step_prompt()
+            self.step_index = 0
         self._execution_step = (self.published.prompt_steps or 0) if self.demonstration_prompt else 0
         self._begin_if_due()
-
-    def _initial_state(self) -> NDArray[np.float64] | None:
-        """Return LIBERO's initial state of the episode, None in other suites, which draw it by the seed.
-
-        Episodes beyond their number begin with the first one again, as in LeRobot.
-        """
-        if self.published.suite not in LIBERO_SUITES:
-            return None
-        states = initial_states(self.published.name)
-        found: NDArray[np.float64] = states[(self.seed - self.settings.seed_base) % len(states)]
-        return found
 
     def draw_holds(self) -> Iterator[int]:
         """Return the lengths of the episode's holds, which do not depend on the variant."""
@@ -167,18 +162,10 @@ class Episode:
             drawn[0] = rng.uniform(0, LONGEST_HOLD)
         return iter(np.ceil(np.minimum(drawn, LONGEST_HOLD)).astype(int).tolist())
 
-    def _new_prompt(self) -> Prompt:
-        """Return the prompt from its beginning; the scene has to be in its initial state."""
+    def _new_prompt(self) -> PromptPlayer:
         longest = PROMPT_HORIZON if self.task.prompt_steps is None else self.task.prompt_steps
         file = prompt_file(self.task, self.seed, self.scene_hash) if self._keeps_prompt else None
-        return prompt_of(PromptDemonstrator(self.task, self.sim, self._rng(2)), self.sim, longest, file)
-
-    def _hide_objects(self) -> None:
-        """Play a hiding prompt before the first frame, so that the objects are hidden although it is not shown."""
-        self.skip_prompt_frames()
-        while self._prompt is not None:
-            self._step_prompt()
-        self.step_index = 0
+        return prompt_player(PromptDemonstrator(self.task, self.sim, self._rng(2)), self.sim, longest, file)
 
     def skip_prompt_frames(self) -> None:
         """Restore only the end of a cached prompt, because its frames are not read."""
@@ -189,12 +176,9 @@ class Episode:
         """Play the next step of the prompt; after its end the scene rests until the execution begins."""
         self.applied_action = np.zeros(ACTION_DIM, np.float32) if self._prompt is None else self._prompt.step()
         self.step_index += 1
-        if self._prompt is not None and self._prompt.over:
-            self._end_prompt(self._prompt)
-
-    def _end_prompt(self, prompt: Prompt) -> None:
-        """Restore the initial scene, except for hidden objects."""
-        self.prompt_shown = prompt.succeeded
+        if self._prompt is None or not self._prompt.over:
+            return
+        self.prompt_shown = self._prompt.succeeded
         if self._reshows:
             self._reshows = False
             self.sim.end_prompt(self._start)
@@ -207,20 +191,18 @@ class Episode:
         self.waits = self._interrupts
 
     def wait(self, last: bool = False) -> None:
-        """Advance the clock while another episode is shown (`interference`); ``last``: no other follows."""
+        """Advance the clock while another episode is shown (`env.Interference`); ``last``: no other follows."""
         self.step_index += 1
         self._execution_step += 1
         self.waits = not last
         self._begin_if_due()
 
     def _corrupt_at(self, step: int) -> None:
-        """Corrupt the memory at this frame if the settings name this execution step."""
         settings = self.settings
         due = settings.corrupt != INTACT and step == settings.corrupt_step and not self.corrupted
         self.corrupts, self.corrupted = due, self.corrupted or due
 
     def _begin_if_due(self) -> None:
-        """Start the execution if the prompt's time is over."""
         if self._prompt is not None or self.waits or self.step_index < self._execution_step:
             return
         self.sim.begin_execution()
@@ -249,10 +231,7 @@ class Episode:
 
     @property
     def clock(self) -> int:
-        """Value of ``step`` in observations: control steps since the phase began.
-
-        In the execution of a strict task: `NO_CLOCK`, and `ENDED` once it has ended.
-        """
+        """Value of ``step`` in observations: steps since the phase began; in a strict execution `NO_CLOCK`, `ENDED`."""
         if self.phase == PROMPT:
             return self.step_index
         if self.task.suite == STRICT:
@@ -334,7 +313,6 @@ class Episode:
             self._event = False
 
     def _act(self, action: ArrayLike) -> Fault | None:
-        """Execute the policy's action; return the fault, if any."""
         try:
             numbers = as_action(action, np.float32)  # before clipping, which turns infinity into 1
             moved = self.pacing.step(np.clip(numbers, -1.0, 1.0))
@@ -357,10 +335,7 @@ class Episode:
         return self._expert.act()
 
     def blind_action(self) -> NDArray[np.float32]:
-        """Return the action (7,) of the published routine, which ignores prompt and instruction.
-
-        Zeros while actions have no effect. Call once per step.
-        """
+        """Return the action (7,) of the published routine, without prompt and instruction; see `expert_action`."""
         if not self.action_has_effect:
             return np.zeros(ACTION_DIM, dtype=np.float32)
         if self._blind is None:
@@ -421,20 +396,17 @@ def _wrong_atoms(task: Task) -> Iterator[Atom]:
     """
     if task.memory_type not in ("object", "procedural"):
         return
-    asked = list(dict.fromkeys(atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)))
+    own = list(dict.fromkeys(atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)))
+    siblings = [
+        Atom(atom.predicate, (*atom.args[:position], other, *atom.args[position + 1 :]))
+        for atom in own
+        for position, name in enumerate(atom.args)
+        for other in task.objects
+        if other not in atom.args and task.objects[other] == task.objects.get(name)
+    ]
     others = [
         atom for k in range(task.num_variants) for each in task.variant(k).checkpoints for atom in atoms(each.goal)
     ]
-    siblings = [sibling for atom in asked for sibling in _siblings(task, atom)]
     for atom in dict.fromkeys([*siblings, *others]):
-        if atom.predicate in ("on", "in") and atom not in asked:
+        if atom.predicate in ("on", "in") and atom not in own:
             yield atom
-
-
-def _siblings(task: Task, atom: Atom) -> Iterator[Atom]:
-    """Yield the atom with one argument replaced by another instance of its class."""
-    for position, name in enumerate(atom.args):
-        class_name = task.objects.get(name)
-        for other, other_class in task.objects.items():
-            if class_name is not None and other_class == class_name and other not in atom.args:
-                yield Atom(atom.predicate, (*atom.args[:position], other, *atom.args[position + 1 :]))

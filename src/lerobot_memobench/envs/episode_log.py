@@ -1,24 +1,23 @@
-"""The episode log of an evaluation: one JSON line per finished rollout.
+"""The episode log of an evaluation: one JSON line per finished rollout, with its outcome.
 
 Each process appends to a file of its own, ``<dir>/episodes/<task>.<pid>.jsonl``, so workers never wait for one another
-and a killed run loses at most the line being written. `read_episodes` merges the files. `evaluation_file` holds the
-settings of the evaluation.
+and a killed run loses at most the line being written. `read_log` merges the files, and joins each line with the facts
+that all lines share: settings, inputs and policy of the evaluation's file (`evaluation_file`).
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NotRequired, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
 
-from annotated_types import Ge, Le
-
-from lerobot_memobench.envs.settings import GOALS, HOLD, MEMORY_CONTROLS, PICTURES, SCENE_HASHES
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLICY, read_evaluation
+from lerobot_memobench.envs.settings import INTACT, steps_per_action
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -28,19 +27,16 @@ from lerobot_memobench.io import (
     Whole,
     checked,
     count_of,
-    cut,
     file_bytes,
     file_name,
     packed,
     parsed,
     write_file,
 )
-from lerobot_memobench.protocol import BY_PAPER
-from lerobot_memobench.sim.scene_hash import FORMER, LIBERO, WORLD
-from lerobot_memobench.tasks.difficulty import STANDARD, Difficulty
+from lerobot_memobench.tasks.catalogue import group_of, suite_of
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
-from lerobot_memobench.tasks.task import PUBLISHED, STRICT, Task
+from lerobot_memobench.tasks.task import REFERENTS, STRICT, Task
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
@@ -51,49 +47,9 @@ EPISODES_FOLDER = "episodes"
 MERGED_FILE = "episodes.jsonl"
 WRITTEN_AT = "written_at"
 """Key in the workers' files only: time of writing, s since 1970. The newest of several lines counts."""
-INPUTS = "inputs"
-"""Key of the policy's inputs, see `observations.policy_inputs`; absent in older logs."""
-POLICY = "policy"
 
-
-@dataclass(frozen=True)
-class Acting:
-    """The policy of an evaluation, as the log names it. It is unknown in gymnasium and in LeRobot's trainings.
-
-    Attributes:
-        policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.
-        inputs: inputs of the policy in words; None if unknown.
-        run: name of this start of the evaluation; a log may hold several starts of one policy.
-        seeds: seeds of the requested episodes; None if unknown. Whole batches are run, so there may be other
-            episodes, which are not logged.
-    """
-
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    inputs: str | None = None
-    run: str | None = None
-    seeds: range | None = None
-
-    def counts(self, seed: int) -> bool:
-        """Return whether the episode of a seed was requested."""
-        return self.seeds is None or seed in self.seeds
-
-    @property
-    def protocol(self) -> dict[str, Any]:
-        """Known entries of the protocol: inputs and policy."""
-        return _known({INPUTS: self.inputs, POLICY: dict(self.policy) or None})
-
-    @property
-    def line(self) -> dict[str, Any]:
-        """Known fields that every line of the log holds."""
-        return _known({POLICY: self.policy.get("identity"), "run": self.run, INPUTS: self.inputs})
-
-
-UNKNOWN_POLICY = Acting()
-
-
-def _known(facts: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in facts.items() if value is not None}
-
+Key = tuple[str, int]
+"""Identity of an episode in its evaluation: task and number."""
 
 # --- lines ---
 
@@ -112,107 +68,65 @@ class CheckpointRecord(TypedDict):
     ordered_step: NotRequired[Count | None]
 
 
-class Outcome(TypedDict, total=False):
-    """Fields of an episode that a log and a card share; logs of other tools omit some.
-
-    Attributes:
-        seed: seed of the scene: seed base + episode, except in evidence episodes.
-        referent: fixed, random, or drawn (strict tasks).
-        variant: index of the task's variant; 0 is the published one.
-        salt: mixed into the draws of variant and holds; sealed test only.
-        replan_steps: actions executed per prediction, if known.
-        prompt_steps: control steps before the execution.
-        steps: execution steps.
-        paused_steps: control steps of pauses; only with pauses.
-        held_steps: control steps of holds; strict tasks only.
-        corrupt: delete, swap or noise of the policy's memory; absent without.
-        corrupt_step: execution step of the corruption; absent for 0, the end of the prompt.
-        reshow: whether the prompt played a second time; absent without.
-        interference: number of episodes of other tasks before the execution; absent without.
-        corrupted: whether the memory was corrupted before the episode ended.
-        choice: evidence episodes: variant that the policy acted on; None for no variant.
-        answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
-        variants: evidence episodes: number of variants of the task.
-        chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
-        failure: failure class; None for a success.
-        suite: ``strict``, or a suite of LIBERO; absent for published tasks.
-        difficulty: absent for the standard one.
-        world: ``libero``; absent for the scenes that version 0.2 modelled in code.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        protocol: ``upstream``, the authors' evaluation; absent for the paper's.
-        convention: of the pictures; absent for upright ones.
-        observation_height: of the pictures, pixels; absent for 256.
-        observation_width: of the pictures, pixels; absent for 256.
-        camera_name_mapping: LIBERO's names of cameras -> names of pictures; absent without.
-        lost: strict tasks: whether the goal became unreachable.
-        fault: reason why the episode was aborted: an invalid action or unstable physics.
-        scene_hash: hash of the initial scene.
-        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
-    """
-
-    seed: Whole | None
-    referent: Name
-    variant: Count | None
-    salt: Name
-    replan_steps: Count | None
-    prompt_steps: Count | None
-    steps: Count | None
-    paused_steps: Whole
-    held_steps: Whole
-    corrupt: Name
-    corrupt_step: Count
-    reshow: bool
-    interference: Count
-    corrupted: bool
-    choice: Count | None
-    answered: bool
-    variants: Count
-    chance: Number | None
-    failure: Name | None
-    suite: Name
-    difficulty: Difficulty
-    world: Name
-    stand_ins: list[Name]
-    protocol: Name
-    convention: Name
-    observation_height: Count
-    observation_width: Count
-    camera_name_mapping: dict[Name, Name]
-    lost: bool
-    fault: str
-    scene_hash: Name | None
-    settled: bool
-
-
-class EpisodeRecord(Outcome):
+class EpisodeRecord(TypedDict):
     """A line of the log.
 
     Attributes:
         task: name in the catalogue.
         memory_type: temporal, spatial, object or procedural; the suite of a task of LIBERO.
         episode: number of the episode in its evaluation, from 0.
-        success: whether the goal held at the end.
-        checkpoints: memory checkpoints in the task's order.
+        seed: seed of the scene: seed base + episode, except in evidence episodes.
+        variant: index of the task's variant; 0 is the published one.
+        prompt_steps: control steps before the execution.
         prompt_shown: whether the demonstration prompt succeeded; None without a prompt.
+        steps: execution steps.
+        paused_steps: control steps of pauses; only with pauses.
+        held_steps: control steps of holds; strict tasks only.
+        corrupted: whether the memory was corrupted before the episode ended; only with corruption.
+        success: whether the goal held at the end.
+        choice: evidence episodes: variant that the policy acted on; None for no variant.
+        answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
+        variants: evidence episodes: number of variants of the task.
+        chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
+        checkpoints: memory checkpoints in the task's order.
+        failure: failure class; None for a success.
+        fault: reason why the episode was aborted: an invalid action or unstable physics.
+        lost: strict tasks: whether the goal became unreachable.
+        stand_ins: classes whose missing scans this package's objects replaced.
+        scene_hash: hash of the initial scene.
+        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
         wall_s: duration of the episode, s.
         not_run: reason why the episode could not be run. Such a line is no rollout and enters no rate.
-        policy: type and hash of the policy.
-        run: name of the start of the evaluation.
-        inputs: inputs of the policy.
         written_at: time of writing, s since 1970; in the workers' files only.
     """
+
+    __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]  # a line that states settings is of another format
 
     task: Name
     memory_type: Name
     episode: Whole
-    success: bool
-    checkpoints: list[CheckpointRecord]
+    seed: NotRequired[Whole | None]
+    variant: NotRequired[Count | None]
+    prompt_steps: NotRequired[Count | None]
     prompt_shown: NotRequired[bool | None]
+    steps: NotRequired[Count | None]
+    paused_steps: NotRequired[Whole]
+    held_steps: NotRequired[Whole]
+    corrupted: NotRequired[bool]
+    success: bool
+    choice: NotRequired[Count | None]
+    answered: NotRequired[bool]
+    variants: NotRequired[Count]
+    chance: NotRequired[Number | None]
+    checkpoints: list[CheckpointRecord]
+    failure: NotRequired[Name | None]
+    fault: NotRequired[str]
+    lost: NotRequired[bool]
+    stand_ins: NotRequired[list[Name]]
+    scene_hash: NotRequired[Name | None]
+    settled: NotRequired[bool]
     wall_s: NotRequired[Number | None]
     not_run: NotRequired[str]
-    policy: NotRequired[Name | None]
-    run: NotRequired[Name | None]
-    inputs: NotRequired[Name | None]
     written_at: NotRequired[Number]
 
 
@@ -236,15 +150,12 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         "memory_type": task.memory_type,
         "episode": number,
         "seed": episode.seed,
-        "referent": episode.referent,
         "variant": task.variant_index,
-        **({"salt": episode.settings.salt} if episode.settings.salt else {}),
-        "replan_steps": episode.settings.replan_steps,
         "prompt_steps": episode.exec_start if episode.exec_start is not None else episode.step_index,
         "prompt_shown": episode.prompt_shown,
         "steps": episode.exec_steps,
         **({"paused_steps": episode.pacing.paused_steps} if episode.pacing.pauses else {}),
-        **_memory_controls(episode),
+        **({} if episode.settings.corrupt == INTACT else {"corrupted": episode.corrupted}),
         "success": episode.success,
         **({} if choice is None else evidence_line(task, choice.variant, choice.answered)),
         "checkpoints": [
@@ -253,22 +164,12 @@ def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, An
         ],
         "failure": failure if fault is None else fault.failure,
         **({} if fault is None else {"fault": fault.why}),
-        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
         **({"lost": episode.lost, "held_steps": episode.pacing.held_steps} if task.suite == STRICT else {}),
-        **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
-        **{WORLD: LIBERO, "stand_ins": list(episode.stand_ins)},
-        **({} if episode.settings.protocol == BY_PAPER else {"protocol": episode.settings.protocol}),
+        "stand_ins": list(episode.stand_ins),
         "scene_hash": episode.scene_hash,
         **({} if episode.sim.settled else {"settled": False}),
         "wall_s": round(wall_s, 3),
     }
-
-
-def _memory_controls(episode: Episode) -> dict[str, Any]:
-    """Return the settings of corruption and interference that differ from the protocol's, and their effect."""
-    settings = episode.settings
-    found = {name: value for name, usual in MEMORY_CONTROLS.items() if (value := getattr(settings, name)) != usual}
-    return found | ({"corrupted": episode.corrupted} if "corrupt" in found else {})
 
 
 def evidence_line(task: Task, choice: int | None, answered: bool) -> dict[str, Any]:
@@ -276,29 +177,28 @@ def evidence_line(task: Task, choice: int | None, answered: bool) -> dict[str, A
     return {"choice": choice, "answered": answered, "variants": len(task.random_variants), "chance": chance(task)}
 
 
-def key_of(record: Mapping[str, Any]) -> tuple[str, int, str]:
-    """Return the identity of an episode: task, number, referent."""
-    return record["task"], record["episode"], record.get("referent", "fixed")
-
-
-def not_run_record(
-    task: Task, number: int, seed: int, referent: str, why: str, variants: int | None = None
-) -> dict[str, Any]:
+def not_run_record(task: Task, number: int, seed: int, why: str, variants: int | None = None) -> dict[str, Any]:
     """Return the log line of an episode that could not be run; arguments are fields of `EpisodeRecord`."""
     return {
         "task": task.name,
         "memory_type": task.memory_type,
         "episode": number,
         "seed": seed,
-        "referent": referent,
         "success": False,
         **({} if variants is None else {"variants": variants}),
         "checkpoints": [],
-        **({} if task.suite == PUBLISHED else {"suite": task.suite}),
-        **({} if task.difficulty == STANDARD else {"difficulty": task.difficulty}),
-        WORLD: LIBERO,
         "not_run": why,
     }
+
+
+def key_of(record: Mapping[str, Any]) -> Key:
+    """Return the identity of an episode in its evaluation."""
+    return record["task"], record["episode"]
+
+
+def seed_base(record: Mapping[str, Any]) -> int:
+    """Return the seed of episode 0, computed from a rollout's own; a scene may be run with each of its variants."""
+    return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
 
 
 # --- writing ---
@@ -359,20 +259,30 @@ def _ends_torn(file: Any) -> bool:
     return bool(file.read(1) != b"\n")
 
 
-def write_episodes(directory: str | Path, records: list[dict[str, Any]]) -> Path:
-    """Add missing ``records`` to ``<directory>/episodes.jsonl`` atomically and return its path.
+def write_episodes(directory: str | Path, records: Iterable[Mapping[str, Any]]) -> Path:
+    """Add the missing lines of ``records`` to ``<directory>/episodes.jsonl`` atomically and return its path.
 
     Existing lines stay unchanged, including unreadable ones. Readers use the last line of an episode.
     """
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    there = {key_of(record): record for record in _read_lines(path, [])} if path.is_file() else {}
-    lines = [json.dumps(record) + "\n" for record in records if there.get(key_of(record)) != record]
-    if lines or not path.is_file():
+    logged = {key_of(line): line for line in _read_file(path, [])} if path.is_file() else {}
+    new = [line for line in map(line_of, records) if logged.get(key_of(line)) != line]
+    if new or not path.is_file():
         content = path.read_bytes() if path.is_file() else b""
         torn = b"\n" if content and not content.endswith(b"\n") else b""
-        write_file(path, content + torn + "".join(lines).encode())
+        write_file(path, content + torn + log_text(new).encode())
     return path
+
+
+def log_text(records: Iterable[Mapping[str, Any]]) -> str:
+    """Return the lines of a log, without facts that they share."""
+    return "".join(json.dumps(line_of(record)) + "\n" for record in records)
+
+
+def line_of(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the line of a record: its outcome, without facts of the evaluation's file."""
+    return {name: value for name, value in record.items() if name in EpisodeRecord.__annotations__}
 
 
 # --- reading ---
@@ -384,6 +294,122 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
     if problems is not None:
         problems += notes_on_not_run(records)
     return [record for record in records if "not_run" not in record]
+
+
+def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
+    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file; see `joined`.
+
+    Args:
+        problems: see `read_lines`.
+
+    Raises:
+        MemobenchError: see `read_lines` and `joined`; or there is no evaluation's file.
+    """
+    lines = read_lines(directory, problems)
+    return joined(Path(directory), read_evaluation(Path(directory)), lines)
+
+
+def joined(folder: Path, card: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return lines with the facts of their evaluation's file: settings, inputs, and ``policy``, its identity.
+
+    Raises:
+        MemobenchError: no episode of these settings can have written a line.
+    """
+    facts = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
+    policy = card[POLICY].get("identity") or card[POLICY].get("type")
+    facts |= {} if policy is None else {POLICY: policy}
+    # Tasks of a user may have names of the catalogue; without settings it is unknown.
+    own_tasks = card.get("settings", {"env": {"task_dir": ""}}).get("env", {}).get("task_dir") is not None
+    records = [{**facts, **line} for line in lines]
+    for record in records:
+        if contradictions := [*_contradictions(record, own_tasks)]:
+            raise MemobenchError(
+                f"{folder}: {record['task']}, episode {record['episode']}, contradicts {EVALUATION_FILE} "
+                f"({'; '.join(contradictions)}, in the file and in the log); restore both files, or evaluate again"
+            )
+    return records
+
+
+def _contradictions(record: Mapping[str, Any], own_tasks: bool) -> Iterator[str]:
+    """Yield what a line states that its settings exclude: it is of another evaluation, or was changed."""
+    base, evidence, pauses = record.get("seed_base"), record.get("evidence"), record.get("pause_steps")
+    if None not in (base, record.get("seed")) and seed_base(record) != base:
+        yield f"seed_base: {base} and {seed_base(record)}"
+    longest = (record.get("horizon") or math.inf) * steps_per_action(record.get("speed") or 1.0)
+    if (record.get("steps") or 0) > longest:
+        yield f"steps: at most {longest} and {record['steps']}"
+    if record.get("referent") == REFERENTS[0] and not evidence and record.get("variant"):
+        yield f"variant: 0 and {record['variant']}"
+    of_settings = {
+        **dict.fromkeys(("choice", "answered", "variants", "chance"), evidence),
+        **dict.fromkeys(("lost", "held_steps"), record.get("suite") == STRICT),
+        **{"paused_steps": pauses, "corrupted": record.get("corrupt", INTACT) != INTACT},
+    }
+    extra = [name for name, given in of_settings.items() if name in record and not given]
+    yield from (f"{name}: absent and {record[name]}" for name in extra)
+    if "not_run" not in record:
+        needed = {"choice": evidence, "paused_steps": pauses}
+        yield from (f"{name}: recorded and absent" for name, given in needed.items() if given and name not in record)
+    if suite_of(record["task"]) is not None and not own_tasks:
+        memory_type = group_of(record["task"])
+        if memory_type != record["memory_type"]:
+            yield f"memory_type: {memory_type} and {record['memory_type']}"
+
+
+def read_lines(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
+    """Return all lines logged in ``directory``, sorted by task and episode, including episodes not run.
+
+    Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
+    counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
+    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes.
+
+    Raises:
+        MemobenchError: the folder does not exist or contains no log.
+    """
+    directory = Path(directory)
+    files = _log_files(directory)
+    if not files:
+        raise _without_log(directory)
+    found: list[str] = []
+    newest: dict[Key, tuple[float, dict[str, Any]]] = {}
+    outcomes: dict[Key, set[bool]] = {}
+    for file in files:
+        for line in _read_file(file, found):
+            written = float(line.pop(WRITTEN_AT, 0.0))
+            key = key_of(line)
+            if "not_run" not in line:
+                outcomes.setdefault(key, set()).add(line["success"])
+            if key not in newest or written >= newest[key][0]:
+                newest[key] = (written, line)
+    twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
+    if twice:
+        found.append(
+            f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
+            f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
+        )
+    if problems is not None:
+        problems += found
+    else:
+        for problem in found:
+            logger.warning("%s", problem)
+    return [newest[key][1] for key in sorted(newest)]
+
+
+def _without_log(directory: Path) -> MemobenchError:
+    """Return the error for a folder without a log, with the folder that may have been meant."""
+    if not directory.is_dir():
+        hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
+        return MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
+    if (directory / "meta" / "info.json").is_file():
+        return MemobenchError(
+            f"{directory} is a LeRobotDataset, expected the folder of an evaluation; read it by `memobench describe`"
+        )
+    nested = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
+    first = next(nested, None)
+    return MemobenchError(
+        f"{directory} holds no episode log; expected {MERGED_FILE} or {EPISODES_FOLDER}/*.jsonl, as an "
+        f"evaluation writes them{'' if first is None else f'; there is one in {first.parent}'}"
+    )
 
 
 def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
@@ -405,71 +431,6 @@ def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
     return notes
 
 
-def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all lines logged in ``directory``, sorted by task, episode and referent, including episodes not run.
-
-    Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
-    counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
-    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes.
-
-    Raises:
-        MemobenchError: the folder does not exist, contains no log, or contains a log of several policies.
-    """
-    directory = Path(directory)
-    if not directory.is_dir():
-        hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
-        raise MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
-    files = _log_files(directory)
-    if not files and (directory / "meta" / "info.json").is_file():
-        raise MemobenchError(
-            f"{directory} is a LeRobotDataset, expected the folder of an evaluation; read it by `memobench describe`"
-        )
-    if not files:
-        nested = (file for depth in ("*", "*/*") for file in sorted(directory.glob(f"{depth}/{MERGED_FILE}*")))
-        first = next(nested, None)
-        raise MemobenchError(
-            f"{directory} holds no episode log; expected {MERGED_FILE} or {EPISODES_FOLDER}/*.jsonl, as an "
-            f"evaluation writes them{'' if first is None else f'; there is one in {first.parent}'}"
-        )
-    found: list[str] = []
-    policies: dict[str | None, tuple[Path, dict[str, Any]]] = {}
-    newest: dict[tuple[str, int, str], tuple[float, dict[str, Any]]] = {}
-    outcomes: dict[tuple[str, int, str], set[bool]] = {}
-    for file in files:
-        for record in _read_lines(file, found):
-            policies.setdefault(record.get("policy"), (file, record))
-            written = float(record.pop(WRITTEN_AT, 0.0))
-            key = key_of(record)
-            if "not_run" not in record:
-                outcomes.setdefault(key, set()).add(record["success"])
-            if key not in newest or written >= newest[key][0]:
-                newest[key] = (written, record)
-    _check_one_policy(directory, policies)
-    twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
-    if twice:
-        found.append(
-            f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
-            f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
-        )
-    if problems is not None:
-        problems += found
-    else:
-        for problem in found:
-            logger.warning("%s", problem)
-    return [newest[key][1] for key in sorted(newest)]
-
-
-def _check_one_policy(directory: Path, policies: Mapping[str | None, tuple[Path, Mapping[str, Any]]]) -> None:
-    """Raise for a log of several policies (identity -> file and one of its lines), whose rates would be mixed."""
-    known = [(name, *place) for name, place in policies.items() if name is not None]
-    if len(known) > 1:
-        named = " and ".join(f"{name} ({record['task']}, in {file.name})" for name, file, record in known[:2])
-        raise MemobenchError(
-            f"{directory} holds episodes of {len(known)} policies: {named}; they are not one evaluation. Evaluate each "
-            "into a folder of its own, or sort the lines by their `policy` into such folders"
-        )
-
-
 def has_log(directory: Path) -> bool:
     """Return whether ``directory`` contains rollouts of an evaluation."""
     return bool(_log_files(directory))
@@ -487,7 +448,7 @@ def _log_files(directory: Path) -> list[Path]:
     return whole + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))
 
 
-def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
+def _read_file(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
     try:
         content = file_bytes(file)
     except OSError as error:
@@ -505,79 +466,3 @@ def _read_lines(file: Path, problems: list[str]) -> Iterator[dict[str, Any]]:
             yield checked(record, EpisodeRecord)
         except Malformed as error:
             problems.append(f"{file}, line {number}: {error}; left out")
-
-
-# --- the protocol ---
-
-
-OMITTED: dict[str, Any] = {
-    **{"suite": PUBLISHED, WORLD: FORMER, "difficulty": STANDARD, "protocol": BY_PAPER},
-    **PICTURES,
-    **{"camera_name_mapping": None, "robot_state": False},
-    **{"pause_steps": 0, "speed": 1.0, "evidence": False, HOLD: 0, GOALS: 1, SCENE_HASHES: 1, "render_every": 1},
-    **{"window_steps": 1, "delay_steps": 0, "salt": None},
-    **MEMORY_CONTROLS,
-}
-"""Values of settings that a protocol omits because they did not exist when it was written. ``render_every``, control
-steps per rendered picture, exists in earlier versions only."""
-OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
-"""Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
-between compared evaluations, not between parts of one."""
-EXTENT = ("tasks", "episodes")
-"""Extent of an evaluation. It may differ between compared evaluations, which use their common episodes."""
-MOST_EPISODES = 100_000
-"""Largest number of episodes of one task; bounds the memory that a damaged file can request."""
-Episodes = Annotated[int, Ge(0), Le(MOST_EPISODES)]
-
-
-def with_omitted(protocol: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a protocol with the values of settings that earlier versions omit."""
-    return {**OMITTED, **protocol}
-
-
-def differences(
-    a: Mapping[str, Any],
-    b: Mapping[str, Any],
-    *,
-    extent: bool = False,
-    policy: bool = False,
-    ignore: Collection[str] = (),
-) -> list[str]:
-    """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
-
-    A setting that one protocol omits (logs of other tools) is no difference, unless it is in `OMITTED`.
-
-    Args:
-        extent: whether tasks and number of episodes are compared.
-        policy: whether the policy's identity and the version of scene hashes are compared, as between parts of one
-            evaluation.
-        ignore: settings that may differ.
-    """
-    left_out = {*ignore, POLICY, *(() if extent else EXTENT), *(() if policy else (SCENE_HASHES,))}
-    first = {k: v for k, v in with_omitted(a).items() if k not in left_out}
-    found = _differing(first, with_omitted(b))
-    earlier = " (an earlier version hashed scenes otherwise)"
-    found = [f"{each}{earlier if each.startswith(SCENE_HASHES) else ''}" for each in found]
-    if policy:
-        found += _differing(a.get(POLICY) or {}, b.get(POLICY) or {}, f"{POLICY}.")
-    return found
-
-
-def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
-    found = []
-    for key, value in a.items():
-        if key not in b or b[key] == value:
-            continue
-        other = b[key]
-        if isinstance(value, Mapping) and isinstance(other, Mapping):
-            found += _differing(value, other, f"{prefix}{key}.")
-        else:
-            found.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
-    return found
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, list):
-        return cut(str(value))
-    shown = ", ".join(cut(str(each)) for each in value[:3])
-    return f"{shown}, … ({len(value)})" if len(value) > 3 else shown

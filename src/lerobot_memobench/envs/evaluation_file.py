@@ -1,50 +1,69 @@
-"""The file of an evaluation, ``evaluation.json``: protocol, policy, settings, starts and outcomes.
+"""The file of an evaluation, ``evaluation.json``: all facts that its episodes share.
 
-`lerobot eval` writes all of it (`run.card`). LeRobot's own commands and vla-evaluation-harness write the protocol only,
-when the first episode ends. Earlier versions wrote ``card.json`` and ``protocol.json``; both are still read.
+`lerobot eval` writes all of it (`run.card`). LeRobot's own commands and vla-evaluation-harness write protocol and
+policy only, when the first episode ends. Outcomes are in the log alone (`episode_log`).
 """
 
 from __future__ import annotations
 
 import json
 import typing
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired, TypedDict
 
 from annotated_types import Ge, Le, MinLen
 
-from lerobot_memobench.envs.episode_log import (
-    INPUTS,
-    POLICY,
-    CheckpointRecord,
-    Episodes,
-    Outcome,
-    differences,
-)
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LARGEST, Count, Name, Number, Whole, is_there, read_json, write_file
-from lerobot_memobench.sim.scene_hash import WORLD
+from lerobot_memobench.io import LARGEST, Count, Name, Number, Whole, cut, is_there, read_json, write_file
 
 EVALUATION_FILE = "evaluation.json"
-EARLIER_CARD, EARLIER_PROTOCOL = "card.json", "protocol.json"
-FORMAT = 2
-"""1: the card of earlier versions, with LeRobot's flags instead of settings."""
+FORMAT = 3
+INPUTS, POLICY = "inputs", "policy"
+"""Key of the policy's inputs in the protocol (`observations.policy_inputs`), and of the policy."""
+EXTENT = ("tasks", "episodes")
+"""Extent of an evaluation. It may differ between compared evaluations, which use their common episodes."""
+OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
+"""Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
+between compared evaluations, not between parts of one."""
+MOST_EPISODES = 100_000
+"""Largest number of episodes of one task; bounds the memory that a damaged file can request."""
 
-# --- the protocol ---
+
+@dataclass(frozen=True)
+class Acting:
+    """The policy of an evaluation, as its file names it. It is unknown in gymnasium and in LeRobot's trainings.
+
+    Attributes:
+        policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.
+        inputs: inputs of the policy in words; None if unknown.
+        seeds: seeds of the requested episodes; None if unknown. Whole batches are run, so there may be other
+            episodes, which are not logged.
+    """
+
+    policy: Mapping[str, Any] = field(default_factory=dict)
+    inputs: str | None = None
+    seeds: range | None = None
+
+    def counts(self, seed: int) -> bool:
+        """Return whether the episode of a seed was requested."""
+        return self.seeds is None or seed in self.seeds
+
+
+UNKNOWN_POLICY = Acting()
+
+# --- its schema ---
 
 _CHECKED: dict[Any, Any] = {
-    int: Count | None | list[Count | None],
+    int: Count | None,
     float: Number | None,
-    str: Name | None | list[Name | None],
+    str: Name | None,
     bool: bool | None,
-    dict[str, str]: dict[Name, Name] | None | list[dict[Name, Name] | None],
+    dict[str, str]: dict[Name, Name] | None,
 }
-"""Type of a setting -> type of its value in a file; joined parts may differ and then give a list."""
-
-
+"""Type of a setting -> type of its value in a file."""
 _HINTS = typing.get_type_hints(EnvSettings)
 _FIELDS: dict[str, Any] = {
     **{
@@ -52,35 +71,22 @@ _FIELDS: dict[str, Any] = {
         for each in fields(EnvSettings)
         if each.name not in NOT_COMPARED
     },
-    **{WORLD: Name | list[Name], HOLD: Count | None, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name | None},
+    **{HOLD: Count, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name},
 }
 Settings: Any = TypedDict("Settings", _FIELDS, total=False)  # type: ignore[misc]
-"""Settings that must agree between two evaluations to be compared, as a file holds them."""
-
-
-class PolicyIdentity(TypedDict, total=False):
-    """Identity of the policy in a protocol without a card, see `episode_log.Acting`."""
-
-    type: Name | None
-    identity: Name
-    sha256: str | None
+"""Settings that must agree between two evaluations to be compared."""
 
 
 class Protocol(Settings, total=False):
-    """The protocol of an evaluation; a resumable one contains ``tasks`` and ``episodes``.
+    """The protocol of an evaluation; one of `lerobot eval` contains ``tasks`` and ``episodes``.
 
     Attributes:
         tasks: names, sorted.
         episodes: number requested per task.
-        policy: identity of the policy.
     """
 
     tasks: list[Name]
-    episodes: Episodes
-    policy: PolicyIdentity
-
-
-# --- the other parts ---
+    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
 
 
 class PolicySettings(TypedDict, total=False):
@@ -96,6 +102,7 @@ class Policy(TypedDict, total=False):
 
     Attributes:
         type: type registered with LeRobot.
+        identity: the type, and a hash over the checkpoint and the settings that differ from it.
         seed: LeRobot's seed in this evaluation.
         settings: complete configuration.
         sha256: hash over the checkpoint's files.
@@ -103,6 +110,7 @@ class Policy(TypedDict, total=False):
     """
 
     type: Name | None
+    identity: Name
     seed: Whole | None
     settings: PolicySettings
     sha256: str | None
@@ -123,7 +131,7 @@ class Checkpoint(TypedDict):
     files: NotRequired[dict[str, str]]
 
 
-class Start(TypedDict, total=False):
+class Start(TypedDict):
     """One start of the evaluation, on one machine.
 
     Attributes:
@@ -132,7 +140,6 @@ class Start(TypedDict, total=False):
         versions: versions of Python and packages.
         git_commit: commit of this package, in a checkout.
         machine: processor, cores, GPU, operating system.
-        gl: OpenGL renderer; earlier versions only.
         times: number of equal starts.
     """
 
@@ -141,138 +148,162 @@ class Start(TypedDict, total=False):
     versions: dict[str, str]
     git_commit: str | None
     machine: dict[str, Any]
-    gl: dict[str, Any]
-    times: Count
+    times: NotRequired[Count]
 
 
-class CardEpisode(Outcome):
-    """Outcome of an episode.
+class CardSettings(TypedDict, total=False):
+    """Settings of an evaluation that its protocol does not hold, see `run.settings.EvaluationSettings`.
 
     Attributes:
-        task: name in the catalogue.
-        episode: number of the episode, from 0.
-        memory_type: temporal, spatial, object or procedural.
-        success: whether the goal held at the end.
-        checkpoints: memory checkpoints in the task's order.
+        env: other fields of `MemobenchEnvConfig`, such as tasks and videos.
+        policy: ``path`` or ``type``, and the given settings of the policy's configuration.
+        batch_size: environments at once.
+        use_async_envs: whether each has a process of its own.
+        rename_map: names of the environment's observations -> names of the policy's.
     """
 
-    task: Name
-    episode: Whole
-    memory_type: NotRequired[str]
-    success: NotRequired[bool]
-    checkpoints: NotRequired[list[CheckpointRecord]]
+    __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]
+
+    env: dict[str, Any]
+    policy: dict[str, str | bool | float | list[Any] | None]
+    batch_size: Annotated[int, Ge(0), Le(512)] | None
+    use_async_envs: bool | None
+    rename_map: dict[str, str]
 
 
 class Card(TypedDict):
-    """The content of the file. To resume, merge or rerun an evaluation, all fields of `WHOLE` are required.
+    """The content of the file. To resume, merge or rerun an evaluation, all fields are required.
 
     Attributes:
         format: version of the format.
-        written: time.
         protocol: tasks, episodes, and the settings that must agree between two evaluations to be compared.
         policy: facts that must agree to resume the evaluation.
+        written: time.
         checkpoint: of the policy; None for a policy without one.
         trained_on: LeRobot's settings of the training dataset.
         task_files: task -> hash of its files.
-        flags: format 1: LeRobot's flags, without folders.
-        settings: format 2: settings of environment, policy and evaluation; `memobench rerun` repeats them.
+        settings: what `memobench rerun` repeats besides the protocol.
         shard: part of a larger evaluation, or None.
         runs: each start, on each machine.
-        episodes: outcomes.
     """
 
-    format: NotRequired[Literal[1, 2]]
-    written: NotRequired[str]
+    format: Literal[3]
     protocol: Protocol
-    policy: NotRequired[Policy]
+    policy: Policy
+    written: NotRequired[str]
     checkpoint: NotRequired[Checkpoint | None]
     trained_on: NotRequired[dict[str, Any] | None]
     task_files: NotRequired[dict[str, str]]
-    flags: NotRequired[list[str]]
-    settings: NotRequired[dict[str, Any]]
+    settings: NotRequired[CardSettings]
     shard: NotRequired[str | None]
     runs: NotRequired[Annotated[list[Start], MinLen(1)]]
-    episodes: NotRequired[list[CardEpisode]]
 
 
-WHOLE = ("format", "policy", "checkpoint", "trained_on", "task_files", "shard", "runs", "episodes")
-WHOLE_PROTOCOL = ("tasks", "episodes")
-WHOLE_START = ("command", "batch_size", "versions", "git_commit", "machine")
-
-# --- reading ---
+# --- reading and writing ---
 
 
 def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return the content of an evaluation's file, or of the files of an earlier version.
+    """Return the content of an evaluation's file.
 
     Args:
         place: folder of the evaluation, or a file.
-        whole: require everything that resuming and repeating need. Otherwise a folder without a file gives {}.
+        whole: require everything that resuming and repeating need.
 
     Raises:
-        MemobenchError: the file is missing, incomplete or malformed.
+        MemobenchError: the file is missing, incomplete, malformed or of another format.
     """
     file = place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
     advice = "expected an evaluation's file as `lerobot eval` writes it"
-    found: dict[str, Any]
-    if not is_there(file) and (not whole or is_there(place / EARLIER_CARD)):
-        found, file = _earlier(place), place / EARLIER_CARD
-    else:
-        try:
-            found = read_json(file, Card, advice)
-        except FileNotFoundError:
-            raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
-    if whole and (missing := _missing(found)):
+    try:
+        found: dict[str, Any] = read_json(file, Card, advice)
+    except FileNotFoundError:
+        raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
+    missing = [name for name in Card.__annotations__ if name not in found]
+    missing += [f"{name} in protocol" for name in EXTENT if name not in found["protocol"]]
+    if whole and missing:
         raise MemobenchError(f"{file}: found no {', '.join(missing)}; {advice}")
     return found
 
 
-def _missing(card: Mapping[str, Any]) -> list[str]:
-    """Return the absent fields that resuming and repeating need."""
-    missing = [key for key in WHOLE if key not in card]
-    missing += [f"{key} in protocol" for key in WHOLE_PROTOCOL if key not in card["protocol"]]
-    starts = card.get("runs", [])
-    return missing + [
-        f"{key} in runs[{k}]" for k, start in enumerate(starts) for key in WHOLE_START if key not in start
-    ]
+def has_evaluation(folder: Path) -> bool:
+    """Return whether a folder contains an evaluation's file."""
+    return is_there(folder / EVALUATION_FILE)
 
 
-def _earlier(folder: Path) -> dict[str, Any]:
-    """Return the files of earlier versions, merged into one."""
-    found: dict[str, Any] = {}
-    for name, kind in ((EARLIER_CARD, Card), (EARLIER_PROTOCOL, Protocol)):
-        if is_there(folder / name):
-            held = read_json(folder / name, kind, "remove the file, or evaluate into another folder")
-            held = held if name == EARLIER_CARD else {"protocol": held}
-            found = {**found, **held, "protocol": {**found.get("protocol", {}), **held["protocol"]}}
-    return found
+def facts_of(settings: EnvSettings, acting: Acting) -> dict[str, Any]:
+    """Return the content of the file for environments of these settings, without facts of `lerobot eval`."""
+    inputs = {} if acting.inputs is None else {INPUTS: acting.inputs}
+    return {"format": FORMAT, "protocol": {**settings.protocol_block, **inputs}, POLICY: dict(acting.policy)}
 
 
-# --- the protocol of a folder ---
+def check_facts(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Refuse a folder with an evaluation of another protocol or policy.
 
-
-def protocol_of(folder: Path) -> dict[str, Any]:
-    """Return the protocol of an evaluation's file, {} without a file."""
-    found: dict[str, Any] = read_evaluation(folder).get("protocol", {})
-    return found
-
-
-def check_protocol(folder: Path, protocol: Mapping[str, Any]) -> bool:
-    """Return whether the folder already contains this protocol; raise if it contains another one."""
-    earlier = protocol_of(folder)
-    found = differences(earlier, protocol, policy=True) if earlier else []
-    if found:
+    Raises:
+        MemobenchError: the first values are those of the folder.
+    """
+    if not has_evaluation(folder):
+        return
+    if found := differences_of_parts(read_evaluation(folder), facts):
         what = "policy" if all(each.startswith(f"{POLICY}.") for each in found) else "protocol"
         raise MemobenchError(
             f"{folder} holds episodes of another {what} ({'; '.join(found)}, the first value being that of the "
             "episodes there); evaluate into another folder"
         )
-    return bool(earlier)
 
 
-def write_protocol(folder: Path, protocol: Mapping[str, Any]) -> None:
-    """Write the protocol of an evaluation without a card; keep an equal file, and raise for another protocol."""
-    if not check_protocol(folder, protocol):
-        folder.mkdir(parents=True, exist_ok=True)
-        text = json.dumps({"format": FORMAT, "protocol": dict(protocol)}, indent=1) + "\n"
-        write_file(folder / EVALUATION_FILE, text, durable=True)
+def write_facts(folder: Path, facts: Mapping[str, Any]) -> None:
+    """Write the file of an evaluation; keep an existing one. Errors as of `check_facts`."""
+    check_facts(folder, facts)
+    if not has_evaluation(folder):
+        write_evaluation(folder, facts)
+
+
+def write_evaluation(folder: Path, card: Mapping[str, Any]) -> None:
+    """Write the file of an evaluation atomically."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_file(folder / EVALUATION_FILE, json.dumps(card, indent=1) + "\n", durable=True)
+
+
+# --- agreement of two evaluations ---
+
+
+def differences(
+    a: Mapping[str, Any], b: Mapping[str, Any], *, extent: bool = False, ignore: Collection[str] = ()
+) -> list[str]:
+    """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
+
+    A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`).
+
+    Args:
+        extent: whether tasks and number of episodes are compared.
+        ignore: settings that may differ.
+    """
+    left_out = {*ignore, POLICY, SCENE_HASHES, *(() if extent else EXTENT)}
+    return _differing({name: value for name, value in a.items() if name not in left_out}, b)
+
+
+def differences_of_parts(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """Return the settings, and facts of the policy, in which the files of two parts of one evaluation differ."""
+    settings = {name: value for name, value in a["protocol"].items() if name not in EXTENT}
+    return _differing(settings, b["protocol"]) + _differing(a[POLICY], b[POLICY], f"{POLICY}.")
+
+
+def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
+    found = []
+    for key, value in a.items():
+        if key not in b or b[key] == value:
+            continue
+        other = b[key]
+        if isinstance(value, Mapping) and isinstance(other, Mapping):
+            found += _differing(value, other, f"{prefix}{key}.")
+        else:
+            found.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
+    return found
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, list):
+        return cut(str(value))
+    shown = ", ".join(cut(str(each)) for each in value[:3])
+    return f"{shown}, … ({len(value)})" if len(value) > 3 else shown

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, RESET, STEPS, EnvSettings
+from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.protocol import (
@@ -42,7 +42,7 @@ ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
 REWARDS = (SPARSE, CHECKPOINTS)
-"""Values of ``reward``; see `memobench_env.MemobenchEnv`."""
+"""Values of ``reward``; see `env.MemobenchEnv`."""
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 
@@ -79,16 +79,7 @@ def _ignores_objects(policy: Any) -> bool:
 
 
 def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
-    """Check that an ``obs_type`` contains the inputs of a policy.
-
-    Args:
-        policy: configuration of the policy.
-        obs_type: setting of the environment.
-        suite: of the tasks; those of LIBERO have pictures alone.
-
-    Raises:
-        MemobenchError: pictures or objects are missing.
-    """
+    """Raise `MemobenchError` unless an ``obs_type`` contains the inputs of a policy; LIBERO's have pictures alone."""
     needed = obs_type_of(policy)
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
@@ -104,10 +95,8 @@ def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
     """Return the names of a policy's inputs, without the arm's state; everything in ``obs_type`` if unknown.
 
-    Args:
-        policy: configuration of the policy, or its class. A declared attribute ``inputs`` is returned.
-        obs_type: setting of the environment.
-        oracle_memory: whether the instruction ends with the completed checkpoints.
+    ``policy`` is a configuration or its class. A declared attribute ``inputs`` is returned. With ``oracle_memory`` the
+    instruction ends with the completed checkpoints.
     """
     found = getattr(policy, "inputs", None)
     if not isinstance(found, tuple):
@@ -128,11 +117,6 @@ def chooses_inputs(policy: object) -> bool:
 def reads_prompt(policy: object) -> bool:
     """Return whether a policy's configuration, or its class, declares ``reads_prompt``."""
     return bool(getattr(policy, "reads_prompt", False))
-
-
-def prompt_in(policy: object | None) -> str:
-    """Return `STEPS` if a policy's configuration reads prompts or is None, else `RESET`."""
-    return STEPS if policy is None or reads_prompt(policy) else RESET
 
 
 # --- shapes ---
@@ -163,18 +147,12 @@ def policy_names(settings: EnvSettings = DEFAULTS) -> dict[str, str]:
 
 
 def _pictures(settings: EnvSettings) -> dict[str, str]:
-    """Return the environment's name -> the policy's name of each picture."""
     names = () if settings.obs_type == OBJECTS else settings.pictures.values()
     return {f"pixels/{name}": f"observation.images.{name}" for name in names}
 
 
 def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
-    """Return the space of observations.
-
-    Args:
-        settings: settings of the environment.
-        longest: maximum number of control steps of an execution.
-    """
+    """Return the space of observations; an execution has at most ``longest`` control steps."""
     reach = np.repeat(np.array([3.0, 2 * np.pi, 0.1], np.float32), (3, 3, 2))  # m, rad, m
     longest += (1 + settings.reshow) * PROMPT_HORIZON + settings.longest_interference
     parts: dict[str, spaces.Space[Any]] = {
@@ -191,17 +169,17 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
     if settings.robot_state:
-        groups = {name: {key: _any(shape) for key, shape in group.items()} for name, group in ROBOT_STATE.items()}
-        parts["robot_state"] = spaces.Dict({name: spaces.Dict(group) for name, group in groups.items()})
+        parts["robot_state"] = spaces.Dict(
+            {
+                name: spaces.Dict({key: spaces.Box(-np.inf, np.inf, shape, np.float64) for key, shape in group.items()})
+                for name, group in ROBOT_STATE.items()
+            }
+        )
     if settings.expert_action:
         parts["expert_action"] = action_space()
     if settings.blind_action:
         parts["blind_action"] = action_space()
     return spaces.Dict(parts)
-
-
-def _any(shape: tuple[int, ...]) -> spaces.Space[Any]:
-    return spaces.Box(-np.inf, np.inf, shape, np.float64)
 
 
 def action_space() -> spaces.Space[NDArray[np.float32]]:
@@ -221,9 +199,6 @@ def blank(space: spaces.Space[Any]) -> Any:
 
 class Observer:
     """Render pictures and compute objects only for frames that are read.
-
-    Args:
-        settings: settings of the environment; pictures of `frame` are upright.
 
     Attributes:
         needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except

@@ -29,13 +29,10 @@ FEWEST_STEPS_AWAY = 2
 class Pacing:
     """Map the policy's actions to the actions that are executed.
 
-    Args:
-        settings: uses ``pause_steps``; ``speed``: at 1/n an action takes n control steps, each with 1/n of its
-            displacement; ``replan_steps``: actions per prediction; ``window_steps``; ``delay_steps``.
-        rng: draws the start of each pause.
+    At a ``speed`` of 1/n an action takes n control steps, each with 1/n of its displacement.
 
     Attributes:
-        pauses: whether the settings contain pauses.
+        pauses: whether the settings contain pauses, whose starts ``rng`` draws.
         paused_steps, held_steps: control steps of pauses and of holds so far.
     """
 
@@ -46,12 +43,12 @@ class Pacing:
         self._rng = rng
         self._actions: list[NDArray[np.float32]] = []  # of the current chunk
         self._step = 0  # within the current chunk
-        self._until_pause = self._gap()  # execution steps
+        self._until_pause = self._pause_interval()  # execution steps
         self._rests = self._held = 0  # remaining steps of this pause, of this hold
         self.paused_steps = self.held_steps = 0
         self._shortest_hold = shortest_hold(settings)
 
-    def _gap(self) -> int:
+    def _pause_interval(self) -> int:
         return int(self._rng.integers(*STEPS_BETWEEN_PAUSES, endpoint=True)) if self.pauses else 0
 
     @property
@@ -62,6 +59,7 @@ class Pacing:
     def hold(self, steps: int) -> None:
         """Hold the scene for at least ``steps`` control steps, longer than a plan, until a chunk begins."""
         steps = max(steps, self._shortest_hold)
+        # Round up, so that the hold ends where a chunk of the policy ends; the interrupted chunk is dropped.
         self._held = steps + -(self._step + steps) % (self._chunk * self._stretch)
         self._actions, self._step = [], 0
 
@@ -84,7 +82,7 @@ class Pacing:
         if self._step == self._chunk * self._stretch:
             self._actions, self._step = [], 0
             if self.pauses and self._until_pause <= 0:
-                self._rests, self._until_pause = self._pause, self._gap()
+                self._rests, self._until_pause = self._pause, self._pause_interval()
         return slowed
 
 
@@ -110,13 +108,11 @@ def longest(settings: EnvSettings) -> int:
 
 
 def paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
-    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses.
-
-    A rollout may end in a pause.
-    """
+    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
     chunk = replan_steps or 1
     pause = _whole_chunks(pause_steps, chunk)
     fewest, most = STEPS_BETWEEN_PAUSES
+    # A rollout may end in a pause.
     return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
 
 

@@ -25,11 +25,19 @@ from lerobot_memobench.protocol import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
-from lerobot_memobench.sim.scene_hash import LIBERO, SCENE_HASH_VERSION, WORLD
-from lerobot_memobench.tasks.difficulty import DIFFICULTIES, STANDARD, Degree, degree_of
-from lerobot_memobench.tasks.evidence import check_referent
+from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
-from lerobot_memobench.tasks.task import DRAWN, LIBERO_SUITES, PUBLISHED, REFERENTS, STRICT, SUITES
+from lerobot_memobench.tasks.task import (
+    DIFFICULTIES,
+    DRAWN,
+    LIBERO_SUITES,
+    PUBLISHED,
+    REFERENTS,
+    STANDARD,
+    STRICT,
+    SUITES,
+    horizon_of,
+)
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
 OBS_TYPES = (PIXELS, OBJECTS, BOTH)
@@ -63,9 +71,7 @@ INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
 
-PICTURES: Mapping[str, Any] = {
-    **{"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE},
-}
+PICTURES = {"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
 """Settings of pictures, with the values that a log omits."""
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
@@ -76,10 +82,9 @@ reached without memory by marks in the scene and a clock, goals of revision 2 by
 that passes home, goals of revision 3 by a clock, because returns without an event were held."""
 SCENE_HASHES = "scene_hash_version"
 """Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
-UPSTREAM_ONLY = {
-    **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False},
-    **{"pause_steps": 0, "speed": 1.0, "evidence": False},
-    **MEMORY_CONTROLS,
+UPSTREAM_ONLY: Mapping[str, Any] = {
+    **{"suite": PUBLISHED, "referent": REFERENTS[0], "oracle_memory": False, "evidence": False},
+    **{"pause_steps": 0, "speed": 1.0, **MEMORY_CONTROLS},
 }
 """Settings with a fixed value in the authors' evaluation."""
 LIBERO_ONLY = {
@@ -93,10 +98,9 @@ object slots lack their classes."""
 
 
 def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int | None = None, usual: str = "") -> Any:
-    """Return a field of `EnvSettings`.
+    """Return a field of `EnvSettings`, with its entry in help and reference.
 
     Args:
-        meaning: one line for help and reference.
         values: accepted values; empty for any value of the type.
         least: smallest accepted integer.
         usual: the default in words, where it depends on other settings or on the policy.
@@ -243,12 +247,14 @@ class EnvSettings:
         if self.protocol == UPSTREAM:
             self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
             self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
-        if self.evidence:
-            check_referent(self.referent)
+        if self.evidence and self.referent == REFERENTS[0]:
+            raise MemobenchError(
+                f"evidence=true runs each scene with each variant, but referent={self.referent} allows the published "
+                f"variant only; set referent={REFERENTS[1]}"
+            )
         self._check_memory_controls()
 
     def _check_pictures(self) -> None:
-        """Check that the settings of pictures fit each other and the observations."""
         height, width = self.observation_height, self.observation_width
         if height % 2 or width % 2 or max(height, width) > LARGEST:
             raise MemobenchError(
@@ -258,14 +264,14 @@ class EnvSettings:
         for name, value in PICTURES.items():
             if self.obs_type == OBJECTS and (given := getattr(self, name)) != value:
                 raise MemobenchError(f"{name}={given} is of pictures, and obs_type={OBJECTS} has none; leave it out")
-
-        mapping = self.camera_name_mapping
-        if mapping is not None and self.convention != MIRRORED:
+        if (mapping := self.camera_name_mapping) is None:
+            return
+        if self.convention != MIRRORED:
             raise MemobenchError(
                 f"camera_name_mapping= names LIBERO's pictures, and convention is {self.convention}; set "
                 f"convention={MIRRORED}, or leave camera_name_mapping out"
             )
-        if mapping is not None and not _names_pictures(mapping):
+        if not _names_pictures(mapping):
             raise MemobenchError(
                 f"camera_name_mapping is {mapping!r}; expected different names of letters, digits and _ for "
                 f"{' and '.join(LIBERO_CAMERAS.values())}, as in {EXAMPLE}"
@@ -277,7 +283,6 @@ class EnvSettings:
         return picture_names(self.convention, self.camera_name_mapping)
 
     def _check_memory_controls(self) -> None:
-        """Check that the settings of corruption and interference do not exclude each other."""
         if self.corrupt_step and (self.corrupt == INTACT or self.reshow):
             raise MemobenchError(
                 f"found corrupt_step={self.corrupt_step} with corrupt={self.corrupt} and reshow="
@@ -301,7 +306,6 @@ class EnvSettings:
         return self.reshow or self.interference > 0 or (self.corrupt != INTACT and self.corrupt_step == 0)
 
     def _check(self, name: str, kind: str, accepted: Mapping[str, Any]) -> None:
-        """Check the type of a setting, and its accepted values."""
         value = getattr(self, name)
         optional = value is None and kind.endswith("| None")
         if kind.startswith("int") and not optional:
@@ -313,7 +317,7 @@ class EnvSettings:
                 raise MemobenchError(f"{name} is {value!r}; expected a number above 0")
         elif kind == "bool" and not isinstance(value, bool | np.bool_):
             raise MemobenchError(f"{name} is {value!r}; expected true or false")
-        elif accepted["values"] and value not in accepted["values"]:
+        elif accepted["values"]:
             check_choice(name, value, accepted["values"])
 
     def _require(self, fixed: Mapping[str, Any], reason: str) -> None:
@@ -331,17 +335,12 @@ class EnvSettings:
             object.__setattr__(self, name, value)
 
     @property
-    def degree(self) -> Degree:
-        """Repetitions and horizon of the difficulty."""
-        return degree_of(self.difficulty)
-
-    @property
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
         limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
         named = self.suite in limits or self.camera_name_mapping is not None
         return {
-            "horizon": limits.get(self.suite, self.degree.horizon),
+            "horizon": limits.get(self.suite, horizon_of(self.difficulty)),
             "convention": MIRRORED if named else UPRIGHT,  # as in LeRobot's environment `libero`
         }
 
@@ -367,13 +366,13 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {WORLD: LIBERO, **agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
+        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
 
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
-SETTINGS = (WORLD, *(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED))
-"""Settings with an effect on rollouts, and the source of the scenes."""
+SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
+"""Settings with an effect on rollouts."""
 
 
 def revision(suite: str, difficulty: str) -> dict[str, int]:
@@ -387,7 +386,6 @@ def steps_per_action(speed: float) -> int:
 
 
 def _names_pictures(mapping: Any) -> bool:
-    """Return whether a ``camera_name_mapping`` gives LIBERO's cameras names that a picture can have."""
     if not isinstance(mapping, Mapping) or not {*mapping} <= {*LIBERO_CAMERAS.values()}:
         return False
     names = [*picture_names(MIRRORED, mapping).values()]

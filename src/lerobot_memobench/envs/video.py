@@ -1,16 +1,12 @@
-"""Videos of evaluations: frames annotated with task and checkpoints, encoded while the simulation runs.
+"""Videos of evaluations: frames annotated with task and checkpoints.
 
 LeRobot's own videos keep all frames of ten episodes in memory and omit the last frame, in which the goal becomes true.
 """
 
 from __future__ import annotations
 
-import os
-from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of
+from lerobot_memobench.io import draft_of, explaining_disk_errors
 from lerobot_memobench.protocol import CONTROL_HZ, PROMPT
 
 if TYPE_CHECKING:
@@ -84,7 +79,6 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
 def _band(
     width: int, language: str, operations: tuple[str, ...], done: int, now: str, prompt: bool
 ) -> NDArray[np.uint8]:
-    """Return the text without the clock, (BAND, width, 3)."""
     band = Image.new("RGB", (width, BAND), _BACKGROUND)
     draw = ImageDraw.Draw(band)
     text, font = _fit(draw, language, 14, width - CLOCK)
@@ -100,14 +94,12 @@ def _band(
 
 @lru_cache(maxsize=64)
 def _piece(text: str, prompt: bool) -> NDArray[np.uint8]:
-    """Return the clock's word or a digit, (height, width, 3)."""
     piece = Image.new("RGB", (round(_font(13).getlength(text)), CLOCK_BOTTOM), _BACKGROUND)
     ImageDraw.Draw(piece).text((0, 5), text, fill=_PROMPT_COLOUR if prompt else _FAINT, font=_font(13))
     return np.asarray(piece)
 
 
 def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done: bool) -> None:
-    """Draw a box at ``x`` pixels with a tick, or with the letter of the memory operation."""
     colour = OPERATION_COLOURS[operation]
     box = (x, 34, x + 20, 54)
     draw.rounded_rectangle(box, 4, fill=colour if done else None, outline=colour, width=2)
@@ -121,108 +113,60 @@ def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done:
 
 LAST_FRAMES = 20
 """Repetitions of the final frame: one second."""
-AHEAD = 2
-"""Maximum number of frames that wait for the encoder; adding another one blocks."""
-FORMAT = "yuv420p"
-"""Pixel format of the file."""
 
 
 class _DiscardedError(Exception):
-    """The video was discarded."""
-
-
-@cache
-def _encoder(process: int) -> ThreadPoolExecutor:
-    """Return the encoder thread of this process; a forked process needs its own."""
-    return ThreadPoolExecutor(1, "video")
+    """Makes `draft_of` remove the draft."""
 
 
 class VideoRecorder:
     """Write frames to an MP4 file that appears under its name only when it is complete.
 
-    A thread opens, encodes and writes in the order of the calls; PyAV and x264 release the GIL. `add` and `finish`
-    raise a `MemobenchError` if the video cannot be written; call `discard` then.
-
-    Args:
-        path: the file.
+    `add` and `finish` raise a `MemobenchError` if the video cannot be written; call `discard` then.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._writing = ExitStack()
         self._container: Any = None
-        self._size: tuple[int, int] | None = None
-        self._waiting: deque[Future[VideoFrame]] = deque()
-        self._error: Exception | None = None
+        self._last: VideoFrame | None = None
 
     def add(self, frame: NDArray[np.uint8]) -> None:
         """Append a copy of a frame (height, width, 3); height and width must be even and constant."""
         from av import VideoFrame
 
-        self._size = height, width = self._size or (frame.shape[0], frame.shape[1])
-        picture = self._next() if len(self._waiting) == AHEAD else VideoFrame(width, height, "rgb24")
-        plane = picture.planes[0]  # lines may be padded
-        lines = np.frombuffer(plane, np.uint8).reshape(height, plane.line_size)
-        lines[:, : 3 * width].reshape(height, width, 3, copy=False)[:] = frame
-        self._later(self._encode, picture)
+        if self._last is not None and frame.shape[:2] != (self._last.height, self._last.width):
+            raise ValueError(f"a frame of shape {frame.shape} follows one of {self._last.height} × {self._last.width}")
+        self._last = VideoFrame.from_ndarray(frame, format="rgb24")
+        with explaining_disk_errors(self._path, "or set videos=0"):
+            if self._container is None:
+                self._open(*frame.shape[:2])
+            self._encode(self._last)
 
     def finish(self) -> Path | None:
         """Repeat the last frame and complete the file; return its path, None without frames."""
-        if not self._waiting:
+        if self._last is None:
             return None
-        while self._waiting:
-            last = self._next()
-        self._later(self._end, last)
-        self._next()
+        with explaining_disk_errors(self._path, "or set videos=0"):
+            for _ in range(LAST_FRAMES):
+                self._last.pts = None  # the encoder numbers it
+                self._encode(self._last)
+            self._container.mux(self._stream.encode())
+            container, self._container = self._container, None
+            container.close()
+            self._writing.close()
         return self._path
 
     def discard(self) -> None:
-        """Delete an unfinished video and the frames that wait for the encoder."""
-        self._error = _DiscardedError()
-        wait(self._waiting)
-        self._waiting.clear()
-        with suppress(_DiscardedError), self._writing:  # an error removes the draft
+        """Delete an unfinished video."""
+        with suppress(_DiscardedError), self._writing:
             if self._container is not None:
                 with suppress(Exception):  # the file is removed anyway
                     self._container.close()
                 self._container = None
             raise _DiscardedError
 
-    def _later(self, work: Callable[[VideoFrame], None], picture: VideoFrame) -> None:
-        """Submit work on a picture to the thread."""
-        self._waiting.append(_encoder(os.getpid()).submit(self._do, work, picture))
-
-    def _next(self) -> VideoFrame:
-        """Wait for the oldest submitted work; return its picture for reuse."""
-        picture = self._waiting.popleft().result()
-        if self._error is not None:
-            reason = getattr(self._error, "strerror", None)  # of the system or FFmpeg
-            if reason is None:
-                raise self._error
-            raise MemobenchError(
-                f"the video {self._path} cannot be written ({reason}); free disk space, choose another output_dir=, or "
-                "set videos=0"
-            ) from self._error
-        return picture
-
-    # --- in the thread ---
-
-    def _do(self, work: Callable[[VideoFrame], None], picture: VideoFrame) -> VideoFrame:
-        """Do the work unless an error occurred before: after an error, FFmpeg ends the process on the next call."""
-        if self._error is None:
-            try:
-                work(picture)
-            except Exception as error:
-                self._error = error
-        return picture
-
-    def _encode(self, picture: VideoFrame) -> None:
-        """Append a picture; the encoder converts and copies it."""
-        if self._container is None:
-            self._open(picture)
-        self._container.mux(self._stream.encode(picture))
-
-    def _open(self, picture: VideoFrame) -> None:
+    def _open(self, height: int, width: int) -> None:
         import av
 
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -230,16 +174,7 @@ class VideoRecorder:
         # Ultrafast takes a tenth of the time of rendering; more threads are slower. crf 20 keeps small text readable.
         options = {"preset": "ultrafast", "crf": "20", "threads": "1"}
         self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ, options=options)
-        self._stream.height, self._stream.width = picture.height, picture.width
-        self._stream.pix_fmt = FORMAT
+        self._stream.height, self._stream.width, self._stream.pix_fmt = height, width, "yuv420p"
 
-    def _end(self, picture: VideoFrame) -> None:
-        """Repeat the last picture and complete the file."""
-        last = picture.reformat(format=FORMAT)
-        for _ in range(LAST_FRAMES):
-            last.pts = None  # the encoder numbers it
-            self._encode(last)
-        self._container.mux(self._stream.encode())
-        container, self._container = self._container, None
-        container.close()
-        self._writing.close()
+    def _encode(self, picture: VideoFrame) -> None:
+        self._container.mux(self._stream.encode(picture))

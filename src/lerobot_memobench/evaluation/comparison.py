@@ -15,10 +15,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.episode_log import OF_ONE_EVALUATION, differences
+from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.evaluation.agreement import SCENES
 from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
@@ -36,7 +35,7 @@ from lerobot_memobench.evaluation.metrics import (
     satisfied,
     varies,
 )
-from lerobot_memobench.evaluation.records import APART, Run, other_draws, other_hashes, other_physics
+from lerobot_memobench.evaluation.records import SCENES, Run, other_draws, other_hashes, other_physics
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     PERMUTATIONS,
@@ -67,7 +66,7 @@ from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
 from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
-ALLOWED = (*(name for name in SETTINGS if name not in APART), SCENES)
+ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.envs.settings import INTACT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run

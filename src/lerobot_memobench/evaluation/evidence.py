@@ -22,7 +22,7 @@ from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, inte
 from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, percent_text, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.difficulty import DIFFICULTIES
+from lerobot_memobench.tasks.task import DIFFICULTIES
 
 RATES = ("follows", "wrong", "undecided", "success")
 """A warranted choice: the answer is the evidence's; another answer was given; none was; the goal held at the end."""

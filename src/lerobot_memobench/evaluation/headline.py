@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from lerobot_memobench.envs.episode_log import OMITTED, POLICY
-from lerobot_memobench.envs.settings import MEMORY_CONTROLS, PICTURES
+from lerobot_memobench.envs.evaluation_file import POLICY
+from lerobot_memobench.envs.settings import DEFAULTS, MEMORY_CONTROLS, PICTURES
 from lerobot_memobench.evaluation.metrics import Record, inputs_phrase, stand_ins_of
-from lerobot_memobench.evaluation.records import Run, of_all
+from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.protocol import PAPER, SPLITS
-from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
+OF_SCENES = ("difficulty", "protocol", *PICTURES)
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
@@ -39,31 +39,28 @@ def policy_name(run: Run) -> str:
     if name is None:
         return "policy not recorded"
     checkpoint = (run.card.get("checkpoint") or {}).get("path")
-    if checkpoint is None:
-        identity = str(policy.get("identity") or name)
-        return identity if identity.startswith(str(name)) else str(name)
-    return f"{name} ({cut(str(checkpoint))})"
+    if checkpoint is not None:
+        return f"{name} ({cut(str(checkpoint))})"
+    return str(name if "settings" in policy else policy.get("identity") or name)
 
 
 def protocol_phrases(run: Run) -> list[str]:
     """Return suite, scenes, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
     records, suites, protocol = run.records, ", ".join(run.suites), run.protocol
     own = run.card.get("settings", {}).get("env", {}).get("task_dir")
-    of_scenes = {key: of_all(records, key) for key in ("difficulty", "protocol", *PICTURES)}
+    unusual = {name: protocol[name] for name in protocol if protocol[name] != getattr(DEFAULTS, name, None)}
     missing, referents = stand_ins_of(records), sorted({str(record.get("referent", "fixed")) for record in records})
     intervals = sorted({steps for record in records if (steps := record.get("replan_steps")) is not None})
-    controls = {name: protocol.get(name, OMITTED[name]) for name in CONTROLLED}
     return [
         f"own tasks, suite={suites}" if own else f"{suites} suite{'s' * (len(run.suites) > 1)}",
-        *["scenes that version 0.2 modelled in code"] * (of_all(records, WORLD) == FORMER),
-        *(f"{key} {value}" for key, value in of_scenes.items() if value != OMITTED[key]),
+        *(f"{name} {unusual[name]}" for name in OF_SCENES if name in unusual),
         *[count_of(len(missing), "missing scan")] * bool(missing),
         *[f"referent {', '.join(referents)}"] * (run.suites[0] not in LIBERO_SUITES),
         *_seeds(run),
         extent_phrase(records),
         *["incomplete"] * (run.missing is not None),
         *[f"replan interval {', '.join(map(str, intervals))}"] * bool(intervals),
-        *(f"{name}={str(value).lower()}" for name, value in controls.items() if value != OMITTED[name]),
+        *(f"{name}={str(unusual[name]).lower()}" for name in CONTROLLED if name in unusual),
         *[f"salt {protocol.get('salt')}"] * bool(protocol.get("salt")),
         *["each scene with each variant"] * bool(protocol.get("evidence")),
     ]

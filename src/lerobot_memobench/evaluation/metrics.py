@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
 
+from lerobot_memobench.envs.episode_log import seed_base
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
@@ -91,11 +92,6 @@ def inputs_phrase(records: Iterable[Record]) -> str:
     return "; ".join([*sorted(known), *rest]) or NOT_RECORDED
 
 
-def seed_base(record: Record) -> int:
-    """Return the seed of episode 0, computed from a rollout's own; a scene may be run with each of its variants."""
-    return int(record["seed"]) - int(record["episode"]) // int(record.get("variants") or 1)
-
-
 def varies(record: Record) -> bool:
     """Return whether the scene of a rollout is run with several variants."""
     return (record.get("variants") or 1) > 1
@@ -108,8 +104,6 @@ PROTOCOL: dict[str, Callable[[Record], Any]] = {
     "seeds of episode 0": lambda record: None if record.get("seed") is None else seed_base(record),
 }
 """Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
-OWNER = ("policy", "run")
-"""Fields of a record that name its policy."""
 
 
 def notes_on(records: Sequence[Record]) -> list[str]:
@@ -166,10 +160,6 @@ def mixtures(records: Iterable[Record]) -> list[str]:
         if len(values) > 1:
             listed = ", ".join(map(str, values[:5])) + (", …" if len(values) > 5 else "")
             notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
-    known = [field for field in OWNER if any(record.get(field) for record in records)]
-    if unnamed := sum(any(not record.get(field) for field in known) for record in records):
-        of_policy = "names no policy" if unnamed == 1 else "name no policy"
-        notes.append(f"{count_of(unnamed, 'rollout')} of {len(records)} {of_policy}; the figures are over all of them.")
     return notes
 
 

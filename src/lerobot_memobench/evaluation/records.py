@@ -1,4 +1,4 @@
-"""Evaluations read back from their folders: result card, protocol, rollouts, names.
+"""Evaluations read back from their folders: the evaluation's file, rollouts, names.
 
 An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
 replan intervals; without names, those of the same policy are. Evaluations of one policy in several suites of LIBERO are
@@ -7,95 +7,75 @@ joined to one, whose average is the mean over suites.
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from lerobot_memobench.envs.episode_log import (
-    EXTENT,
-    MOST_EPISODES,
-    OMITTED,
-    POLICY,
-    differences,
-    has_log,
-    not_run,
-    notes_on_not_run,
-    read_episodes,
-    read_log,
-    with_omitted,
-)
-from lerobot_memobench.envs.evaluation_file import read_evaluation
-from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES, SETTINGS
+from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
+from lerobot_memobench.envs.evaluation_file import EXTENT, MOST_EPISODES, POLICY, differences, read_evaluation
+from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import check_lines, disagreements, extent_of
 from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
-from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, seed_base, summary_of
+from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, summary_of
 from lerobot_memobench.io import count_of
-from lerobot_memobench.sim.scene_hash import FORMER, WORLD
 from lerobot_memobench.tasks.catalogue import GROUPS
-from lerobot_memobench.tasks.task import LIBERO_SUITES
+from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
-# --- the protocol ---
+# --- extent ---
 
 
-def read_protocol(folder: str | Path) -> dict[str, Any]:
-    """Return the protocol of the evaluation in ``folder``.
+class Extent(NamedTuple):
+    """The episodes that an evaluation's file requests.
 
-    Keys: ``tasks`` (names, sorted) and ``episodes`` (per task; the largest number where they differ) as requested, or
-    as the log has them where no file records it; the known settings; ``policy``, the known facts of the policy ({}
-    where no file records them).
-
-    Raises:
-        MemobenchError: there is no evaluation in the folder.
+    Attributes:
+        tasks: names, sorted.
+        episodes: numbers of the episodes of each task.
+        shard: part of the evaluation that the file belongs to, such as ``1/8``; None for all of it.
     """
-    # `read_runs` names problems of the log
-    return _protocol_of(read_evaluation(Path(folder)), lambda: read_episodes(folder, []))
 
+    tasks: Sequence[str]
+    episodes: range
+    shard: str | None
 
-def _protocol_of(card: Mapping[str, Any], records: Callable[[], Sequence[Record]]) -> dict[str, Any]:
-    """Return the protocol of an evaluation by its card and, where this omits settings, by the records of its log."""
-    protocol: dict[str, Any] = card.get("protocol", {})
-    if not {*EXTENT, *SETTINGS} - {*OMITTED} <= set(protocol):
-        protocol = {**protocol_of_log(records()), **protocol}
-    return {**protocol, POLICY: card.get(POLICY) or protocol.get(POLICY) or {}}
+    def includes(self, record: Record) -> bool:
+        """Return whether the episode of a line was requested."""
+        return record["task"] in self.tasks and record["episode"] in self.episodes
 
-
-def protocol_of_log(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the protocol that a log shows; settings in which its episodes differ are lists."""
-    numbers = (record["episode"] + 1 for record in records)
-    seeded = all(record.get("seed") is not None for record in records)
-    values: dict[str, set[Any]] = {
-        "seed_base": {seed_base(record) for record in records if seeded},
-        **{key: {of_all(records, key)} - {OMITTED[key]} for key in ("suite", WORLD, "protocol", *PICTURES)},
-        **{key: {record[key] for record in records if key in record} for key in ("referent", "replan_steps")},
-    }
-    return {
-        "tasks": sorted({record["task"] for record in records}),
-        "episodes": max((number for number in numbers if number <= MOST_EPISODES), default=0),  # others have no number
-        **{key: sorted(each, key=str) if len(each) > 1 else each.pop() for key, each in values.items() if each},
-    }
-
-
-APART = ("suite", WORLD)
-"""Settings whose values are reported separately: other tasks, other scenes."""
-
-
-def of_all(records: Iterable[Mapping[str, Any]], key: str) -> Any:
-    """Return an evaluation's value of ``key``: suite, source of the scenes, protocol or a setting of pictures.
-
-    Raises:
-        MemobenchError: they are of several.
-    """
-    values = {record.get(key, OMITTED[key]) for record in records} or {OMITTED[key]}
-    if len(values) > 1:
-        raise MemobenchError(
-            f"the rollouts are of the {key}s {' and '.join(sorted(map(str, values)))}; report each {key} by itself"
+    def missing(self, lines: Iterable[Record]) -> str | None:
+        """Return a sentence on the episodes without a line, None without such episodes."""
+        logged = {(line["task"], line["episode"]) for line in lines if self.includes(line)}
+        total = len(self.tasks) * len(self.episodes)
+        if len(logged) == total:
+            return None
+        task, episode = next(each for each in itertools.product(self.tasks, self.episodes) if each not in logged)
+        unrun = len(self.tasks) - len({name for name, _ in logged})
+        return (
+            f"missing: {total - len(logged):,} of {count_of(total, 'episode')}"
+            f"{f', with all of {count_of(unrun, "task")}' if unrun else ''}, the first is {task}, episode {episode}"
+            f"{f', in part {self.shard} of an evaluation' if self.shard else ''}; run the same command, or the missing "
+            "parts, with resume=true"
         )
-    return values.pop()
+
+
+def extent_of(card: Mapping[str, Any]) -> Extent | None:
+    """Return the episodes that an evaluation's file asks for, None where LeRobot's own commands wrote it."""
+    protocol = card["protocol"]
+    if not {*EXTENT} <= {*protocol}:
+        return None
+    seed, base = card[POLICY].get("seed"), protocol.get("seed_base")
+    first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
+    return Extent(sorted({*protocol["tasks"]}), range(first, first + protocol["episodes"]), card.get("shard"))
+
+
+def requested(card: Mapping[str, Any], records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the records of a log without episodes that the evaluation's file does not ask for."""
+    extent = extent_of(card)
+    return [record for record in records if extent is None or extent.includes(record)]
 
 
 # --- evaluations ---
@@ -109,6 +89,7 @@ class Run:
 
     Attributes:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
+        records: rollouts, each with the facts of its file. protocol: of the file, with the extent and ``policy``.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
         not_run: task -> episodes that could not be run.
@@ -133,7 +114,7 @@ class Run:
     @property
     def suites(self) -> tuple[str, ...]:
         """The suites of its rollouts."""
-        return tuple(of_all(each.records, "suite") for each in self.evaluations)
+        return tuple(each.protocol.get("suite", PUBLISHED) for each in self.evaluations)
 
     @cached_property
     def summary(self) -> Summary:
@@ -147,7 +128,7 @@ class Run:
 
     @cached_property
     def card(self) -> dict[str, Any]:
-        """What reports take from its card, of the first where several are joined; {} where it has none."""
+        """Its file; of the first where several are joined."""
         return read_evaluation(self.evaluations[0].folder)
 
     @cached_property
@@ -172,15 +153,13 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
     names = folder_names([folder for _, folder in given])
     runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(given, names, strict=True)]
-    for key in APART:
-        values = [of_all(run.evaluations[0].records, key) for run in runs]
-        for run, value in zip(runs, values, strict=True):
-            if value != values[0] and not {value, values[0]} <= {*LIBERO_SUITES}:
-                raise MemobenchError(
-                    f"{runs[0].folder} is an evaluation of {key}={values[0]} and {run.folder} one of {key}={value}, "
-                    f"whose figures do not compare; report each {key} by itself"
-                    f"{f' (world={FORMER}: scenes that version 0.2 modelled in code)' if key == WORLD else ''}"
-                )
+    first = runs[0].suites[0]
+    for run in runs:
+        if (suite := run.suites[0]) != first and not {suite, first} <= {*LIBERO_SUITES}:
+            raise MemobenchError(
+                f"{runs[0].folder} is an evaluation of suite={first} and {run.folder} one of suite={suite}, whose "
+                "figures do not compare; report each suite by itself"
+            )
     return _with_methods(_with_suites_joined(runs))
 
 
@@ -216,6 +195,9 @@ def _joined(parts: Sequence[Run]) -> Run:
                 f"{one.folder} and {other.folder} are of {same}, and an average over suites of LIBERO is of one policy "
                 "and each suite once; give the folders of each policy one name: A=FOLDER A=FOLDER B=FOLDER"
             )
+        for name in PICTURES:
+            if one.protocol.get(name) != other.protocol.get(name):
+                raise MemobenchError(f"{one.folder} and {other.folder} differ in {name}; report each by itself")
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
     protocol = {key: each[0] if each.count(each[0]) == len(parts) else each for key, each in values.items()}
     missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
@@ -250,7 +232,7 @@ def unlike(runs: Sequence[Run]) -> list[str]:
 
 def other_draws(a: Run, b: Run) -> list[str]:
     """Return a sentence where two evaluations of the sealed test have different salts."""
-    mine, other = (with_omitted(run.protocol)["salt"] for run in (a, b))
+    mine, other = (run.protocol.get("salt") for run in (a, b))
     if mine == other:
         return []
     return [
@@ -261,10 +243,10 @@ def other_draws(a: Run, b: Run) -> list[str]:
 
 def other_hashes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
     """Return a sentence where the versions of scene hashes differ between two protocols."""
-    mine, other = (with_omitted(protocol)[SCENE_HASHES] for protocol in (a, b))
+    mine, other = (protocol.get(SCENE_HASHES) for protocol in (a, b))
     if mine == other:
         return []
-    return [f"an earlier version hashed scenes otherwise ({SCENE_HASHES} {mine} and {other}): hashes are not compared"]
+    return [f"the versions hash scenes differently ({SCENE_HASHES} {mine} and {other}): hashes are not compared"]
 
 
 def other_physics(a: Run, b: Run) -> list[str]:
@@ -279,48 +261,31 @@ def other_physics(a: Run, b: Run) -> list[str]:
 
 def read_run(folder: str | Path, name: str | None = None, method: str = "") -> Run:
     """Return an evaluation with warnings: unreadable lines, episodes that are missing, were not run or were broken
-    off, disagreements of log and card, mixed protocols.
+    off, mixed protocols.
 
     Raises:
         MemobenchError: it has no rollouts, or a line contradicts the settings in its file.
     """
-    notes = list[str]()
-    return run_of(Path(folder), read_log(folder, notes), notes, name, method)
-
-
-def run_of(
-    folder: Path, logged: list[dict[str, Any]], notes: list[str], name: str | None = None, method: str = ""
-) -> Run:
-    """Return the evaluation in a folder by all lines of its log, and the notes on reading them; see `read_run`."""
-    card = read_evaluation(folder)
-    lines, extent, notes = requested_lines(folder, logged, card), extent_of(card, logged), [*notes]
-    if len(lines) < len(logged):
-        notes.append(f"{count_of(len(logged) - len(lines), 'rollout')} beyond those that were asked for left out")
-    if card.get("episodes") and (unequal := disagreements(card["episodes"], lines)):
-        notes.append(f"log and card disagree about {count_of(len(unequal), 'episode')}, the first: {unequal[0]}")
-    missing = None if extent is None else extent.missing(lines)
-    notes += [*([] if missing is None else [missing]), *notes_on_not_run(lines)]
-    records = [record for record in lines if "not_run" not in record]
+    folder, notes = Path(folder), list[str]()
+    lines, card = read_lines(folder, notes), read_evaluation(folder)
+    records, extent = requested(card, joined(folder, card, lines)), extent_of(card)
+    if len(records) < len(lines):
+        notes.append(f"{count_of(len(lines) - len(records), 'rollout')} beyond those that were asked for left out")
+    missing = None if extent is None else extent.missing(records)
+    notes += [*([] if missing is None else [missing]), *notes_on_not_run(records)]
+    unrun = {task: len(group) for task, group in not_run(records).items()}
+    protocol = {**_logged_extent(lines), **card["protocol"], POLICY: card[POLICY]}
+    records = [record for record in records if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    protocol = _protocol_of(card, lambda: [record for record in logged if "not_run" not in record])
-    unrun = {task: len(group) for task, group in not_run(lines).items()}
     return Run(name or folder.name, method, folder, records, protocol, [*notes, *notes_on(records)], missing, unrun)
 
 
-def requested_lines(
-    folder: Path, lines: list[dict[str, Any]], card: Mapping[str, Any] | None = None
-) -> list[dict[str, Any]]:
-    """Return the lines of a log to report: without episodes that the evaluation's file does not ask for.
-
-    Raises:
-        MemobenchError: a line contradicts the settings in the file.
-    """
-    card = read_evaluation(folder) if card is None else card
-    check_lines(folder, card, lines)
-    extent = extent_of(card, lines)
-    return lines if extent is None else [record for record in lines if extent.includes(record)]
+def _logged_extent(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the tasks and the number of episodes of a log, for files that do not request them."""
+    numbers = (line["episode"] + 1 for line in lines if line["episode"] < MOST_EPISODES)  # larger ones are damage
+    return {"tasks": sorted({line["task"] for line in lines}), "episodes": max(numbers, default=0)}
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -383,3 +348,62 @@ def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
         if run.replan_steps is not None:
             methods[run.method].append(run)
     return {name: group for name, group in methods.items() if len({run.replan_steps for run in group}) > 1}
+
+
+# --- agreement of two records of the same episode ---
+
+SCENES = "scene_hash"
+OUTCOME = (
+    *("seed", "success", "steps", "prompt_steps", "variant", "choice", "checkpoints", "failure", "fault", "not_run"),
+    *("stand_ins", SCENES),
+)
+"""Fields in which two runs of the same episode must agree."""
+
+
+def disagreement(
+    a: Mapping[str, Any],
+    b: Mapping[str, Any],
+    here: str,
+    there: str,
+    ignore: Collection[str] = (),
+) -> str | None:
+    """Return a phrase for the first difference of two records of the same episode, None where they agree.
+
+    Times, fields to ``ignore``, and fields that one of them lacks, do not count.
+    """
+    if ("not_run" in a) != ("not_run" in b):
+        return f"{_name(a)} was not run {here if 'not_run' in a else there}"
+    for name in OUTCOME:
+        if name in ignore or name not in a or name not in b or a[name] == b[name]:
+            continue
+        values = [(name, a[name], b[name])]
+        if name == "checkpoints" and len(a[name]) == len(b[name]):
+            values = [
+                (f"{key} of checkpoint {number}", mine.get(key), other.get(key))
+                for number, (mine, other) in enumerate(zip(a[name], b[name], strict=True), start=1)
+                for key in ("operation", "first_step", "ordered_step")
+            ]
+        for part, mine, other in values:
+            if mine != other:
+                return f"{_name(a)}: {part} is {mine} {here} and {other} {there}"
+    return None
+
+
+def disagreements(
+    a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]], here: str, there: str, ignore: Collection[str] = ()
+) -> list[str]:
+    """Return a phrase for each episode that differs between two logs, or that one of them lacks."""
+    mine, others = ({key_of(each): each for each in records} for records in (a, b))
+    phrases: list[str | None] = []
+    for key in sorted({*mine, *others}):
+        if key in mine and key in others:
+            phrases.append(disagreement(mine[key], others[key], here, there, ignore))
+        elif key in mine:
+            phrases.append(f"{_name(mine[key])} is {here} and not {there}")
+        else:
+            phrases.append(f"{_name(others[key])} is {there} and not {here}")
+    return [phrase for phrase in phrases if phrase is not None]
+
+
+def _name(record: Mapping[str, Any]) -> str:
+    return f"{record['task']}, episode {record['episode']}"

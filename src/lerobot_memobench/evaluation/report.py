@@ -13,7 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, read_log, with_omitted, write_episodes
+from lerobot_memobench.envs.episode_log import read_lines, write_episodes
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
@@ -32,7 +33,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
     summary_of,
 )
-from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, read_run, sweeps, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
     Name,
@@ -68,10 +69,9 @@ def write_report(directory: str | Path) -> Run:
     Raises:
         MemobenchError: see `read_run`.
     """
-    directory, notes = Path(directory), list[str]()
-    lines = read_log(directory, notes)
-    run = run_of(directory, lines, notes)
-    write_episodes(directory, lines)
+    directory = Path(directory)
+    run = read_run(directory)
+    write_episodes(directory, read_lines(directory, []))
     values = {**report_values(run.summary), **evidence_values(run)}
     if run.not_run:
         values["not_run"] = run.not_run
@@ -535,7 +535,7 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
     import yaml
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
-    suite = with_omitted(run.protocol)["suite"]
+    suite = run.protocol["suite"]
     conditions = "; ".join([headline([run]), *([run.missing] if run.missing else [])])
     entries = [
         EvalResultEntry(

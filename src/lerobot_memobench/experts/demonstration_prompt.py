@@ -27,31 +27,27 @@ HIDING_SPEED_FACTOR = 1.25
 
 
 class PromptDemonstrator:
-    """Play one demonstration prompt.
+    """Play the demonstration prompt of a task, a variant if the referent is random.
 
-    Args:
-        task: task of the episode, a variant if the referent is random.
-        sim: running simulation in the episode's initial state.
-        rng: random source of small variations.
-
-    Attributes:
-        succeeded: whether the last prompt succeeded, for example whether a routine reached its goal.
+    The simulation runs and is in the episode's initial state.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
         assert task.prompt is not None
         self._task, self._sim, self._rng = task, sim, rng
         self._prompt = task.prompt
+        self._referent = task.prompt.target or ""
         self.succeeded = False
+        """Whether the last prompt succeeded, for example whether a routine reached its goal."""
 
     def actions(self) -> Iterator[NDArray[np.float32]]:
         """Yield the actions (7,) of the prompt, one per control step."""
         hand = Hand(self._sim, self._rng)
-        position, rotation = self._sim.eef_pose()
+        home = self._sim.eef_pose()
         yield from hand.wait(PAUSE_STEPS, OPEN)
         match self._prompt.kind:
             case "routine":
-                yield from self._routine(position, rotation)
+                yield from self._routine(*home)
             case "pick":
                 yield from self._pick(hand)
             case "point":
@@ -61,12 +57,8 @@ class PromptDemonstrator:
             case "hide":
                 yield from self._hide()
                 return
-        yield from go_home(hand, position, rotation)
+        yield from go_home(hand, *home)
         yield from hand.wait(PAUSE_STEPS, OPEN)
-
-    def _referent(self) -> str:
-        assert self._prompt.target is not None
-        return self._prompt.target
 
     def _routine(self, position: Array, rotation: Array) -> Steps:
         expert = Expert(self._task, self._sim, self._rng)
@@ -90,17 +82,16 @@ class PromptDemonstrator:
         self.succeeded = all(self._sim.holds(atom) for atom in (*hidden, HAND_HOME))
 
     def _pick(self, hand: Hand) -> Steps:
-        place, turned = self._sim.asset_pose(self._referent())
-        held = yield from pick(hand, self._referent())
+        position, rotation = self._sim.asset_pose(self._referent)
+        held = yield from pick(hand, self._referent)
         if held is not None:
             self.succeeded = True
             yield from hand.wait(PAUSE_STEPS, CLOSED)
-            yield from put_at(hand, held, place, turned)
+            yield from put_at(hand, held, position, rotation)
 
     def _point(self, hand: Hand) -> Steps:
-        asset = self._sim.assets[self._referent()]
-        place, _ = self._sim.asset_pose(self._referent())
-        above = place + (asset.top + 0.03) * UP
+        place, _ = self._sim.asset_pose(self._referent)
+        above = place + (self._sim.assets[self._referent].top + 0.03) * UP
         rotation = pointing(hand, above)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
         for height in (0.0, 0.05, 0.0):

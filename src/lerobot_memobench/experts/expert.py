@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.experts.fixtures import (
-    close_door,
-    close_drawer,
-    open_door,
-    open_drawer,
-    sweep_door_open,
-    sweep_door_shut,
-    turn_knob,
-)
+from lerobot_memobench.experts import fixtures
 from lerobot_memobench.experts.grasping import pick, put_in_drawer, put_on, put_on_region
 from lerobot_memobench.experts.hand import OPEN, UP, Hand, Steps
 from lerobot_memobench.experts.travel import (
@@ -128,42 +120,26 @@ def plan_of(formula: Formula) -> list[Step]:
 
 def _rank(formula: Formula) -> int:
     """Return the planning order of a part: preconditions (`When`), then placements, then the rest (closing)."""
-    places = isinstance(formula, Atom) and formula.predicate in ("in", "on")
-    return 0 if isinstance(formula, When) else 1 if places else 2
+    is_placement = isinstance(formula, Atom) and formula.predicate in ("in", "on")
+    return 0 if isinstance(formula, When) else 1 if is_placement else 2
 
 
 def _merge_plans(plans: list[list[Step]]) -> list[Step]:
     """Return one plan that contains all plans, with shared steps once."""
-    whole: list[Step] = []
+    merged: list[Step] = []
     for plan in plans:
-        if not _is_subsequence(plan, whole):
-            common = next(n for n in range(len(plan), -1, -1) if n == 0 or whole[-n:] == plan[:n])
-            whole += plan[common:]
-    return whole
-
-
-def _is_subsequence(plan: list[Step], whole: list[Step]) -> bool:
-    """Return whether the steps of a plan occur in another plan, in order."""
-    left = iter(whole)
-    return all(step in left for step in plan)
+        remaining = iter(merged)
+        if not all(step in remaining for step in plan):
+            common = next(n for n in range(len(plan), -1, -1) if n == 0 or merged[-n:] == plan[:n])
+            merged += plan[common:]
+    return merged
 
 
 class Expert:
     """Solve a task: achieve its checkpoints in order, then the goal's remaining atoms.
 
     A goal that counts events defines the plan itself, because the present state does not show past events. The expert
-    reads the simulator state and returns one action per control step.
-
-    Args:
-        task: task with goal and checkpoints.
-        sim: running simulation.
-        rng: random source of small variations in speed, grasp and approach.
-
-    Attributes:
-        done: whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
-            because policies trained on it cannot observe the step in which the goal becomes true.
-        succeeded: whether the goal held at the last call of `act`.
-        hand: controlled arm.
+    reads the state of a running simulation and returns one action per control step; speed, grasps and approaches vary.
     """
 
     def __init__(self, task: Task, sim: Simulation, rng: np.random.Generator) -> None:
@@ -172,7 +148,11 @@ class Expert:
         self._evaluator = Evaluator([task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)])
         self._started = False
         self._motion = self._plan()
-        self.done = self.succeeded = False
+        self.done = False
+        """Whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
+        because policies trained on it cannot observe the step in which the goal becomes true."""
+        self.succeeded = False
+        """Whether the goal held at the last call of `act`."""
 
     def act(self) -> NDArray[np.float32]:
         """Return the action (7,) for the present state; after the plan come to rest with open fingers.
@@ -208,7 +188,6 @@ class Expert:
             yield self.hand.rest(OPEN)
 
     def _run_step(self, step: Step) -> Steps:
-        """Achieve an atom, or rest at home."""
         if isinstance(step, Hold):
             rest = step.number
         else:
@@ -237,9 +216,9 @@ class Expert:
             case "close", (name,):
                 yield from self._close(name)
             case (("turnon" | "wasturnedon"), (name,)):
-                yield from turn_knob(self.hand, name, on=True)
+                yield from fixtures.turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
-                yield from turn_knob(self.hand, name, on=False)
+                yield from fixtures.turn_knob(self.hand, name, on=False)
             case "in", (name, region):
                 yield from self._place_until_holds(atom, lambda: self._put_in(name, region))
             case "on", (name, support):
@@ -257,11 +236,10 @@ class Expert:
     def _put_on(self, name: str, support: str) -> Steps:
         on_object = support in self.sim.assets
         middle = self.sim.asset_pose(support)[0] if on_object else self._region_top(support)
-        place = middle - self.sim.assets[name].bottom * UP
         drawer = drawer_containing(self.hand, name)
         if drawer is not None:
             yield from self.achieve(Atom("open", (drawer,)))
-        held = yield from pick(self.hand, name, place=place)
+        held = yield from pick(self.hand, name, place=middle - self.sim.assets[name].bottom * UP)
         if held is not None and on_object:
             yield from put_on(self.hand, held, support)
         elif held is not None:
@@ -277,28 +255,19 @@ class Expert:
         return centre + rotation @ np.array([0.0, 0.0, half[2]])
 
     def _open(self, name: str) -> Steps:
-        door = sweep_door_open if self.task.suite == STRICT else open_door
-        return (door if self._is_door(name) else open_drawer)(self.hand, name)
+        # Not `Hand.strict`: the blind routine solves a published task in a strict scene.
+        door = fixtures.sweep_door_open if self.task.suite == STRICT else fixtures.open_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.open_drawer)(self.hand, name)
 
     def _close(self, name: str) -> Steps:
-        door = sweep_door_shut if self.task.suite == STRICT else close_door
-        return (door if self._is_door(name) else close_drawer)(self.hand, name)
-
-    def _is_door(self, name: str) -> bool:
-        return self.sim.world.articulation(name)[0].kind == "door"
+        door = fixtures.sweep_door_shut if self.task.suite == STRICT else fixtures.close_door
+        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.close_drawer)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:
-        drawers = [
-            full
-            for asset in self.sim.assets.values()
-            for part, full in asset.regions.items()
-            if part in asset.articulations
-        ]
+        drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]
         if region not in drawers:
-            known = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
-            raise MemobenchError(
-                f"the expert places objects into drawers only, and {region!r} is not a drawer; {known}"
-            )
+            hint = nearest(region, drawers) if drawers else "the scene has no drawer; use another policy"
+            raise MemobenchError(f"the expert places objects into drawers only, and {region!r} is not a drawer; {hint}")
         articulation, q = self.sim.world.articulation(region)
         if q > articulation.open_below:
             yield from self._open(region)
@@ -306,3 +275,22 @@ class Expert:
         held = yield from pick(self.hand, name, avoid=out)
         if held is not None:
             yield from put_in_drawer(self.hand, held, region, out)
+
+
+def blind_routine(task: Task, sim: Simulation, rng: np.random.Generator) -> Steps:
+    """Reach a published task's goal, return home and repeat, forever: a baseline without memory.
+
+    No state is kept between rounds, so the routine cannot count. It ignores prompt and instruction, and so hidden and
+    indicated objects.
+
+    Args:
+        task: published task; for a strict task the one it is derived from.
+        sim: running simulation; the hand's pose at the first action is home.
+        rng: random source of small variations.
+    """
+    home = sim.eef_pose()
+    while True:
+        expert = Expert(task, sim, rng)
+        while not expert.done:
+            yield expert.act()
+        yield from come_home(expert.hand, *home)

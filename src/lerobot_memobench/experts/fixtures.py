@@ -79,7 +79,6 @@ MAX_SWEEP_STEPS = 150
 
 
 def _joint_position(hand: Hand, name: str) -> float:
-    """Return the present position of a drawer, door or knob, m or rad."""
     return hand.sim.world.articulation(name)[1]
 
 
@@ -91,75 +90,65 @@ def _closing_sign(direction: Array) -> float:
 # --- drawers and knobs ---
 
 
-def _handle_pose(hand: Hand, articulation: Articulation, tilt: float) -> tuple[Array, Array, Array]:
-    """Return a handle's position (3,), the direction (3,) back along the fingers, and the hand's rotation (3, 3).
+@dataclass(frozen=True)
+class _HandleGrip:
+    """Pose of the hand at a drawer's handle.
 
     The fingers close horizontally along the front. The hand is 20 cm wide in that direction and thin in the other, so
     it touches neither the table below the lowest drawer nor the handle above.
     """
-    position, _ = hand.sim.site_pose(articulation.handle_site)
-    out = opening_direction(hand, articulation)
-    back = np.cos(tilt) * out + np.sin(tilt) * UP
-    return position, back, frame(-back, cross(UP, out))
 
+    hand: Hand
+    articulation: Articulation
+    tilt: float
+    """Downward tilt, rad."""
+    roll: float = 0.0
+    """Roll about the fingers, rad."""
 
-def _handle_target(hand: Hand, articulation: Articulation, tilt: float, back: float) -> Callable[[], Array]:
-    """Return the moving target at a distance ``back`` from a handle along the fingers, m."""
+    def pose(self, back: float = 0.0) -> tuple[Array, Array]:
+        """Return the position (3,) at a distance back from the handle along the fingers, m, and the rotation (3, 3)."""
+        position, _ = self.hand.sim.site_pose(self.articulation.handle_site)
+        out = opening_direction(self.hand, self.articulation)
+        direction = np.cos(self.tilt) * out + np.sin(self.tilt) * UP
+        rotation = frame(-direction, cross(UP, out))
+        if self.roll:
+            rotation = Rotation.from_rotvec(self.roll * direction).as_matrix() @ rotation
+        return position + back * direction, rotation
 
-    def target() -> Array:
-        position, direction, _ = _handle_pose(hand, articulation, tilt)
-        return position + back * direction
+    def at(self, back: float) -> Callable[[], Array]:
+        return lambda: self.pose(back)[0]
 
-    return target
+    def turned(self) -> Array:
+        return self.pose()[1]
 
-
-def _handle_grip(hand: Hand, articulation: Articulation, tilt: float, roll: float) -> Array:
-    """Return the hand's rotation (3, 3) for a handle: closing along the front, rolled by ``roll``, rad."""
-    _, back, rotation = _handle_pose(hand, articulation, tilt)
-    return Rotation.from_rotvec(roll * back).as_matrix() @ rotation if roll else rotation
-
-
-def _handle_roll(hand: Hand, articulation: Articulation, tilt: float) -> float:
-    """Return the roll of the hand at a handle, rad: 0 for a short one, for a long bar the side with less collision."""
-
-    def collision(roll: float) -> float:
-        rotation = _handle_grip(hand, articulation, tilt, roll)
-        ways = (_handle_target(hand, articulation, tilt, gap)() for gap in HANDLE_APPROACH)
-        return max(hand_penetration(hand, "", way, rotation, HANDLE_MARGIN) for way in ways)
-
-    rolls = (0.0,) if articulation.handle.length < OPEN_WIDTH else (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL)
-    return min(rolls if hand.strict else rolls[:1], key=collision)
+    def collision(self) -> float:
+        """Return the largest penetration of other objects on the way to the handle, m."""
+        poses = (self.pose(back) for back in HANDLE_APPROACH)
+        return max(hand_penetration(self.hand, "", *pose, HANDLE_MARGIN) for pose in poses)
 
 
 def open_drawer(hand: Hand, region: str) -> Steps:
     """Grasp a drawer's handle and pull until the drawer counts as open."""
     articulation, _ = hand.sim.world.articulation(region)
-    steep = HANDLE_TILT if articulation.handle.length < OPEN_WIDTH else WIDE_HANDLE_TILT
-    tilt = steep + float(hand.rng.uniform(-0.06, 0.06))
+    long = articulation.handle_size[0] >= OPEN_WIDTH  # a bar that fits between the fingers only diagonally
+    tilt = (WIDE_HANDLE_TILT if long else HANDLE_TILT) + float(hand.rng.uniform(-0.06, 0.06))
+    rolls = (WIDE_HANDLE_ROLL, -WIDE_HANDLE_ROLL) if long else (0.0,)
     for _ in range(MAX_ATTEMPTS):
         out = opening_direction(hand, articulation)
-        roll = _handle_roll(hand, articulation, tilt)
-        yield from _take_handle(hand, articulation, tilt, roll)
-        rotation = _handle_grip(hand, articulation, tilt, roll)
+        grips = [_HandleGrip(hand, articulation, tilt, roll) for roll in rolls]
+        grip = min(grips if hand.strict else grips[:1], key=_HandleGrip.collision)
+        far, near, at = map(grip.at, HANDLE_APPROACH)
+        yield from rise(hand, OPEN, 0.16)
+        yield from hand.move(far, grip.turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
+        yield from hand.move(near, grip.turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
+        yield from hand.move(at, grip.turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
+        yield from hand.close()
+        rotation = grip.turned()
         yield from _pull_drawer(hand, region, rotation, out)
         yield from hand.open(6)
-        back = _handle_target(hand, articulation, tilt, 0.09)
-        yield from hand.move(back, rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
+        yield from hand.move(grip.at(0.09), rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
         if _joint_position(hand, region) < articulation.open_below:
             return
-
-
-def _take_handle(hand: Hand, articulation: Articulation, tilt: float, roll: float) -> Steps:
-    far, near, at = (_handle_target(hand, articulation, tilt, gap) for gap in HANDLE_APPROACH)
-
-    def turned() -> Array:
-        return _handle_grip(hand, articulation, tilt, roll)
-
-    yield from rise(hand, OPEN, 0.16)
-    yield from hand.move(far, turned, OPEN, tolerance=0.03, turn_tolerance=0.15)
-    yield from hand.move(near, turned, OPEN, tolerance=0.012, turn_tolerance=0.06)
-    yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=0.6, timeout=60)
-    yield from hand.close()
 
 
 def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
@@ -180,7 +169,7 @@ def close_drawer(hand: Hand, region: str) -> Steps:
     tilt = HANDLE_TILT + float(hand.rng.uniform(-0.06, 0.06))
     for _ in range(MAX_ATTEMPTS):
         out = opening_direction(hand, articulation)
-        rotation = _handle_pose(hand, articulation, tilt)[2]
+        rotation = _HandleGrip(hand, articulation, tilt).turned()
         aside = _free_side(hand, articulation, rotation, out)
         yield from _approach_handle(hand, articulation, rotation, out, aside)
         yield from _push_drawer(hand, region, rotation, out, aside)
@@ -201,7 +190,6 @@ def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Arr
 
 
 def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:
-    """Move the closed fingers in front of a handle, from above."""
 
     def before(gap: float) -> Array:
         return hand.sim.site_pose(articulation.handle_site)[0] + gap * out + aside
@@ -246,19 +234,13 @@ def turn_knob(hand: Hand, name: str, on: bool) -> Steps:
             return
 
 
-def _ridge(hand: Hand, articulation: Articulation) -> tuple[Array, Array]:
-    """Return the position (3,) of a knob's ridge and the hand's rotation (3, 3) for grasping it from above."""
-    position, rotation = hand.sim.site_pose(articulation.handle_site)
-    across = rotation[:, 1] * np.array([1.0, 1.0, 0.0])
-    return position, downward(float(np.arctan2(across[1], across[0])))
-
-
 def _take_ridge(hand: Hand, articulation: Articulation) -> Steps:
     def at(height: float) -> Callable[[], Array]:
-        return lambda: _ridge(hand, articulation)[0] + height * UP
+        return lambda: hand.sim.site_pose(articulation.handle_site)[0] + height * UP
 
     def turned() -> Array:
-        return _ridge(hand, articulation)[1]
+        across = hand.sim.site_pose(articulation.handle_site)[1][:, 1] * np.array([1.0, 1.0, 0.0])
+        return downward(float(np.arctan2(across[1], across[0])))
 
     yield from rise(hand, OPEN)
     yield from hand.move(at(HOVER_HEIGHT), turned, OPEN, tolerance=0.01, turn_tolerance=0.06)
@@ -267,7 +249,6 @@ def _take_ridge(hand: Hand, articulation: Articulation) -> Steps:
 
 
 def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> Steps:
-    """Turn a grasped knob to the position ``aim``, rad."""
     grip = hand.rotation
     articulation, start = hand.sim.world.articulation(name)
     for _ in range(100):
@@ -276,7 +257,7 @@ def _twist(hand: Hand, name: str, aim: float, reached: Callable[[], bool]) -> St
         angle = float(rotation_vector(hand.rotation @ grip.T)[2])
         lead = float(np.clip(aim - start - angle, -0.25, 0.25)) + angle
         goal = Rotation.from_rotvec([0.0, 0.0, lead]).as_matrix() @ grip
-        yield hand.toward(_ridge(hand, articulation)[0], goal, CLOSED)
+        yield hand.toward(hand.sim.site_pose(articulation.handle_site)[0], goal, CLOSED)
 
 
 # --- doors ---
@@ -287,7 +268,6 @@ class Door:
     """Present geometry of a hinged door. Directions are horizontal unit vectors (3,), positions are (3,), m."""
 
     q: float
-    hinge: Array
     handle: Array
     outward: Array
     """Normal of the door's front."""
@@ -309,31 +289,13 @@ def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     outward = outward if outward @ opening > 0 else -outward
     along = cross(UP, outward)
     along = along if along @ lever > 0 else -along
-    edge = _edge(hand, name, handle, outward, along)
-    turn = Rotation.from_rotvec(joint.xaxis * ahead)
-    return Door(
-        q + ahead,
-        hinge,
-        hinge + turn.apply(lever),
-        turn.apply(outward),
-        turn.apply(along),
-        hinge + turn.apply(edge - hinge),
-    )
-
-
-def _edge(hand: Hand, name: str, handle: Array, outward: Array, along: Array) -> Array:
-    """Return the grasp position on a door's upper edge (3,), m."""
-    articulation, _ = hand.sim.world.articulation(name)
-    owner = _owner(hand, name)
-    depth = articulation.handle.clearance + articulation.handle.thickness[0] / 2 + DOOR_THICKNESS / 2
+    owner = max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
+    depth = articulation.clearance + articulation.handle_size[1] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - DOOR_EDGE_INSET * along
     edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
-    return edge
-
-
-def _owner(hand: Hand, name: str) -> str:
-    """Return the fixture of an articulation's name (``microwave_1``, ``cabinet_1_top_region``)."""
-    return max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
+    turned = Rotation.from_rotvec(joint.xaxis * ahead).apply
+    handle, edge = hinge + turned(lever), hinge + turned(edge - hinge)
+    return Door(q + ahead, handle, turned(outward), turned(along), edge)
 
 
 def door_is_at_goal(q: float, articulation: Articulation, opening: bool) -> bool:
@@ -366,9 +328,8 @@ def close_door(hand: Hand, name: str) -> Steps:
 
 
 def _pull_door(hand: Hand, name: str) -> Steps:
-    """Grasp the upper end of a vertical handle and follow the door's arc."""
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    up = (articulation.handle_size[0] / 2 - HANDLE_GRIP_DEPTH) * UP
     flip = _closing_sign(door_geometry(hand, name).along)
 
     def at(height: float, ahead: float = 0.0) -> Callable[[], Array]:
@@ -393,7 +354,6 @@ def _pull_door(hand: Hand, name: str) -> Steps:
 
 
 def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
-    """Grasp a partly open door by its upper edge and follow its arc."""
     articulation, start = hand.sim.world.articulation(name)
     goal = articulation.open_below if opening else articulation.closed_q
     way = float(np.sign(goal - start))
@@ -433,7 +393,6 @@ def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: 
 
 
 def _push_door(hand: Hand, name: str) -> Steps:
-    """Close a door with closed fingers on the outside of its handle."""
     articulation, _ = hand.sim.world.articulation(name)
     way = float(np.sign(articulation.closed_q - articulation.open_q))
     flip = _closing_sign(door_geometry(hand, name).along)
@@ -493,7 +452,7 @@ def _sweep_rotation(hand: Hand, door: Door, place: Array, flip: float) -> Array:
 
 def _sweep_open(hand: Hand, name: str) -> Steps:
     articulation, _ = hand.sim.world.articulation(name)
-    up = (articulation.handle.length / 2 - HANDLE_GRIP_DEPTH) * UP
+    up = (articulation.handle_size[0] / 2 - HANDLE_GRIP_DEPTH) * UP
     flip = _closing_sign(door_geometry(hand, name).along)
 
     def grip(ahead: float = 0.0) -> tuple[Array, Array]:
@@ -508,10 +467,8 @@ def _sweep_open(hand: Hand, name: str) -> Steps:
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(MAX_SWEEP_STEPS):
-        if (
-            door_is_at_goal(door_geometry(hand, name).q, articulation, opening=True)
-            or length(hand.position - grip()[0]) > DROP_DISTANCE
-        ):
+        opened = door_is_at_goal(_joint_position(hand, name), articulation, opening=True)
+        if opened or length(hand.position - grip()[0]) > DROP_DISTANCE:
             break
         yield hand.toward(*grip(way * SWEEP_LEAD), CLOSED)
 

@@ -111,75 +111,8 @@ MAX_RIGHTING_TILT = np.radians(35)
 """Largest tilt of a held object that is corrected before placing, rad."""
 
 
-def _yaw(rotation: Array) -> float:
-    return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
-
-
 def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
     return grasp.symmetric and hand.sim.assets[name].clear_radius > 0 and abs(grasp.position[0]) > 0.02
-
-
-def grasp_pose(
-    hand: Hand,
-    name: str,
-    grasp: Grasp,
-    spin: float,
-    opening: float | None = None,
-    place: Array | None = None,
-    reaching: bool = False,
-    shifted: bool = False,
-) -> tuple[Array, Array]:
-    """Return position (3,) and rotation (3, 3) of the grip site for grasping ``name``.
-
-    A rim is grasped with the inner finger close to the wall at every opening: the hand approaches from outside and
-    follows the outer finger while closing, so the bowl's content is not touched. The hand leans away from obstacles,
-    and towards the base if the object or its destination ``place`` is distant. Obstacle avoidance has priority unless
-    ``reaching``. At a ``shifted`` grasp it may lean further.
-    """
-    opening = hand.sim.gripper_opening() if opening is None else opening
-    position, rotation = hand.sim.asset_pose(name)
-    spun = rotation @ Rotation.from_rotvec([0.0, 0.0, spin]).as_matrix()
-    target = position + spun @ np.asarray(grasp.position)
-    rim = _is_rim(hand, name, grasp)
-    outward = np.zeros(3)
-    if rim:
-        outward = spun[:, 0] * np.sign(grasp.position[0])
-        over = grasp.position[2] - FINGER_REACH - hand.sim.assets[name].supports
-        gap = float(np.clip(RIM_GAP_SLOPE * over, MIN_RIM_GAP, MAX_RIM_GAP))
-        target = target + outward * max(0.0, opening / 2 - grasp.width / 2 - gap)
-    closing = _yaw(rotation) + spin + grasp.yaw
-    if rotation[2, 2] < FALLEN_COSINE:
-        target, rim = position.copy(), False
-        closing = _closing_of_fallen(hand, name)
-    target[2] = max(target[2], _support_height(hand, name) + FINGER_REACH)
-    turn = downward(closing)
-    away = _lean(hand, name, target, turn[:, 0], place, outward if rim else None)
-    largest = MAX_LEAN_UNDER if shifted else MAX_LEAN
-    return target, clear_of_objects(hand, name, target, turn[:, 0], away, reaching, largest)
-
-
-def _support_height(hand: Hand, name: str) -> float:
-    """Return the height of an object's support (table or plate), which the fingers must not press, m."""
-    position, rotation = hand.sim.asset_pose(name)
-    lowest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].min()
-    return max(TABLE_TOP, float(lowest) - MAX_SINKING)
-
-
-def _lean(hand: Hand, name: str, target: Array, closing: Array, place: Array | None, outward: Array | None) -> Array:
-    """Return the lean (3,) at a grasp: direction times angle, rad; ``outward``: slope direction of a rim's wall."""
-    lean = lean_from_fixtures(hand, name, target)
-    # Lean about the closing axis only: the fingers stay level and the thin side of the hand turns away.
-    away = lean - (lean @ closing) * closing
-    reach = reach_lean(hand, target)
-    if place is not None:
-        position, _ = hand.sim.asset_pose(name)
-        there = reach_lean(hand, place + target - position, MAX_STRETCH)
-        reach = max(reach, there, key=length)
-    away = away + reach - (reach @ closing) * closing
-    if outward is not None:
-        # On the base's side the fingers may lean along the bowl's sloping wall.
-        away = away + outward * float(np.clip(reach @ outward, 0.0, MAX_RIM_LEAN))
-    return away
 
 
 def _closing_of_fallen(hand: Hand, name: str) -> float:
@@ -208,15 +141,59 @@ class _Approach:
     grasp: Grasp
     spin: float
     place: Array | None
+    """Destination of the object's origin (3,), m."""
     reaching: bool
+    """Whether reaching has priority over avoiding obstacles."""
     shifted: bool
-    """Whether the grasp is one of `_shifted_grasps`."""
+    """Whether the grasp is one of `_shifted_grasps`, at which the hand may lean further."""
 
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
-        return grasp_pose(self.hand, self.name, self.grasp, self.spin, opening, self.place, self.reaching, self.shifted)
+        """Return position (3,) and rotation (3, 3) of the grip site at an opening of the fingers; default: the present.
+
+        A rim is grasped with the inner finger close to the wall at every opening: the hand approaches from outside and
+        follows the outer finger while closing, so the bowl's content is not touched. The hand leans away from
+        obstacles, and towards the base if the object or its destination is distant.
+        """
+        hand, name, grasp = self.hand, self.name, self.grasp
+        opening = hand.sim.gripper_opening() if opening is None else opening
+        position, rotation = hand.sim.asset_pose(name)
+        spun = rotation @ Rotation.from_rotvec([0.0, 0.0, self.spin]).as_matrix()
+        target = position + spun @ np.asarray(grasp.position)
+        outward = None
+        if _is_rim(hand, name, grasp):
+            outward = spun[:, 0] * np.sign(grasp.position[0])
+            over = grasp.position[2] - FINGER_REACH - hand.sim.assets[name].supports
+            gap = float(np.clip(RIM_GAP_SLOPE * over, MIN_RIM_GAP, MAX_RIM_GAP))
+            target = target + outward * max(0.0, opening / 2 - grasp.width / 2 - gap)
+        closing = float(np.arctan2(rotation[1, 0], rotation[0, 0])) + self.spin + grasp.yaw
+        if rotation[2, 2] < FALLEN_COSINE:
+            target, outward = position.copy(), None
+            closing = _closing_of_fallen(hand, name)
+        # The fingers must not press the object's support, such as table or plate.
+        lowest = position[2] + (rotation @ corners(hand.sim.assets[name]))[2].min()
+        target[2] = max(target[2], max(TABLE_TOP, float(lowest) - MAX_SINKING) + FINGER_REACH)
+        turn = downward(closing)
+        away = self._lean(target, turn[:, 0], outward)
+        largest = MAX_LEAN_UNDER if self.shifted else MAX_LEAN
+        return target, clear_of_objects(hand, name, target, turn[:, 0], away, self.reaching, largest)
+
+    def _lean(self, target: Array, closing: Array, outward: Array | None) -> Array:
+        """Return the lean (3,) at a grasp: direction times angle, rad; ``outward``: slope direction of a rim's wall."""
+        lean = lean_from_fixtures(self.hand, self.name, target)
+        # Lean about the closing axis only: the fingers stay level and the thin side of the hand turns away.
+        away = lean - (lean @ closing) * closing
+        reach = reach_lean(self.hand, target)
+        if self.place is not None:
+            position, _ = self.hand.sim.asset_pose(self.name)
+            reach_at_destination = reach_lean(self.hand, self.place + target - position, MAX_STRETCH)
+            reach = max(reach, reach_at_destination, key=length)
+        away = away + reach - (reach @ closing) * closing
+        if outward is not None:
+            # On the base's side the fingers may lean along the bowl's sloping wall.
+            away = away + outward * float(np.clip(reach @ outward, 0.0, MAX_RIM_LEAN))
+        return away
 
     def above(self) -> Array:
-        """Return the position above the grasp along the fingers, (3,), m."""
         target, turn = self.pose()
         return target - HOVER_HEIGHT * turn[:, 2]
 
@@ -245,7 +222,6 @@ class _Approach:
         return stalled
 
     def closing(self) -> Array:
-        """Return the target position (3,) while the fingers close, m."""
         return self.pose(max(self.hand.sim.gripper_opening() - CLOSING_LEAD, self.grasp.width))[0]
 
 
@@ -258,33 +234,29 @@ def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, plac
         )
     higher = _raised_grasps(asset)
     options = [] if attempt >= LOW_GRASP_ATTEMPTS else _options(hand, name, asset.grasps, avoid, place, reaching=False)
-    if not options or (higher and _reach_shortfall(options[0][1]) > MAX_REACH_SHORTFALL):
+    if not options or (higher and hand.stretch(*options[0][1].pose(OPEN_WIDTH)) - MAX_STRETCH > MAX_REACH_SHORTFALL):
         # Neighbours prevent the lean needed for reaching; above them there is room.
         options = _options(hand, name, higher or asset.grasps, avoid, place, reaching=True)
         attempt = max(0, attempt - LOW_GRASP_ATTEMPTS) if higher else attempt
     options = [option for option in options if option[0] < options[0][0] + MAX_EXTRA_COST]
     # Later attempts take the next distinct candidate, with a small random variation.
     rank = min(attempt * max(1, len(options) // 6), len(options) - 1)
-    _, way = options[rank]
-    return replace(way, spin=way.spin + float(hand.rng.uniform(-0.1, 0.1))) if way.grasp.symmetric else way
+    approach = options[rank][1]
+    if approach.grasp.symmetric:
+        approach = replace(approach, spin=approach.spin + float(hand.rng.uniform(-0.1, 0.1)))
+    return approach
 
 
 def _options(
     hand: Hand, name: str, grasps: Sequence[Grasp], avoid: Array | None, place: Array | None, *, reaching: bool
 ) -> list[tuple[float, _Approach]]:
-    """Return approaches to the grasps with their costs, sorted by cost."""
     options: list[tuple[float, _Approach]] = []
     shifted = _shifted_grasps(hand.sim.assets[name]) if hand.strict else ()
     for grasp in (*grasps, *shifted):
         for spin in np.arange(0.0, 2 * np.pi, np.pi / 12) if grasp.symmetric else [0.0]:
-            way = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
-            options.append((_cost(way, avoid), way))
+            approach = _Approach(hand, name, grasp, float(spin), place, reaching, grasp in shifted)
+            options.append((_cost(approach, avoid), approach))
     return sorted(options, key=lambda option: option[0])
-
-
-def _reach_shortfall(way: _Approach) -> float:
-    """Return the shortfall of the arm's reach for a grasp, m; negative within reach."""
-    return way.hand.stretch(*way.pose(OPEN_WIDTH)) - MAX_STRETCH
 
 
 def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
@@ -301,7 +273,7 @@ def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
 
     They leave room for the hand, or for a finger, between the box and an obstacle. A taller box would tip over.
     """
-    found = []
+    grasps = []
     for grasp in asset.grasps:
         if grasp.symmetric or not asset.top - asset.bottom < grasp.width < WIDE_GRASP:
             continue
@@ -311,32 +283,31 @@ def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
         side = (OPEN_WIDTH - grasp.width) / 2 - MIN_SIDE_GAP
         for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)):
             x, y = np.asarray(grasp.position[:2]) + a * ends * along + b * side * across
-            found.append(replace(grasp, position=(float(x), float(y), grasp.position[2])))
-    return tuple(found)
+            grasps.append(replace(grasp, position=(float(x), float(y), grasp.position[2])))
+    return tuple(grasps)
 
 
-def _cost(way: _Approach, avoid: Array | None) -> float:
-    """Return the cost of a grasp: motion of wrist and arm, collisions, width and stretch."""
-    hand, name = way.hand, way.name
+def _cost(approach: _Approach, avoid: Array | None) -> float:
+    hand, name = approach.hand, approach.name
     here, start = hand.sim.eef_pose()
-    target, turn = way.pose(OPEN_WIDTH)
+    target, turn = approach.pose(OPEN_WIDTH)
     wrist = length(rotation_vector(turn @ start.T))
     cost = 0.3 * wrist + length(target - here) + finger_obstruction_cost(hand, name, target, turn)
     if avoid is not None:
         cost += 2.0 * abs(float(turn[:, 0] @ avoid))
     cost += 3.0 * abs(float(turn[:, 0] @ lean_from_fixtures(hand, name, target)))
     blocked = hand_penetration(hand, name, target, turn)
-    if way.shifted:  # without the margin: the hand pushes its neighbour by a few millimetres
+    if approach.shifted:  # without the margin: the hand pushes its neighbour by a few millimetres
         cost += SHIFTED_COST + 100.0 * max(0.0, blocked - HAND_MARGIN)
     else:
-        cost += (0.0 if way.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
-    cost += 0.3 if way.grasp.width > WIDE_GRASP else 0.0
+        cost += (0.0 if approach.reaching else 2.0) + 20.0 * blocked if blocked > 0.0 else 0.0
+    cost += 0.3 if approach.grasp.width > WIDE_GRASP else 0.0
     position, _ = hand.sim.asset_pose(name)
-    if _is_rim(hand, name, way.grasp):
+    if _is_rim(hand, name, approach.grasp):
         cost += FAR_SIDE_COST * (1.0 + float(unit(target - position) @ hand.radial(position)))
-    ends = [target] if way.place is None else [target, way.place + target - position]
+    ends = [target] if approach.place is None else [target, approach.place + target - position]
     stretch = max(hand.stretch(end, turn) for end in ends)
-    if way.grasp.width >= TIGHT_GRASP and hand.strict:
+    if approach.grasp.width >= TIGHT_GRASP and hand.strict:
         cost += TIGHT_COST * (2.0 if hand.stretch(target, turn) > MAX_STRETCH else 1.0)
     # Beyond `MAX_STRETCH` the hand stops short and closes on an edge, which slips.
     return cost + 20.0 * max(0.0, stretch - COMFORTABLE_STRETCH) + 40.0 * max(0.0, stretch - MAX_STRETCH)
@@ -358,17 +329,16 @@ def pick(
     """
     failed = 0
     for attempt in range(MAX_ATTEMPTS):
-        way = _choose_grasp(hand, name, failed, avoid, place)
-        upright = hand.sim.asset_pose(name)[1][2, 2] if _is_rim(hand, name, way.grasp) else -1.0
+        approach = _choose_grasp(hand, name, failed, avoid, place)
+        upright = hand.sim.asset_pose(name)[1][2, 2] if _is_rim(hand, name, approach.grasp) else -1.0
         yield from rise(hand, OPEN)
-        yield from travel(hand, way.above, way.turned, OPEN, target=name)
-        yield from hand.move(way.above, way.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
-        speed, timeout = (0.6, 60) if way.grasp.width < TIGHT_GRASP else (TIGHT_GRASP_SPEED, 120)
-        yield from hand.move(
-            *(way.at, way.turned, OPEN), tolerance=0.005, speed=speed, timeout=timeout, give_up=way.stall_check()
-        )
+        yield from travel(hand, approach.above, approach.turned, OPEN, target=name)
+        yield from hand.move(approach.above, approach.turned, OPEN, tolerance=0.012, turn_tolerance=0.08)
+        speed, timeout = (0.6, 60) if approach.grasp.width < TIGHT_GRASP else (TIGHT_GRASP_SPEED, 120)
+        at, turned, stalled = approach.at, approach.turned, approach.stall_check()
+        yield from hand.move(at, turned, OPEN, tolerance=0.005, speed=speed, timeout=timeout, give_up=stalled)
         # At a shifted grasp the first finger pushes the object to the other one, so the hand does not follow it.
-        yield from hand.close(None if way.shifted else way.closing, hand.rotation)
+        yield from hand.close(None if approach.shifted else approach.closing, hand.rotation)
         # After a miss retry at once, first at the same place. Otherwise policies would learn to lift an empty hand, or
         # to change the grasp without a visible reason.
         failed += attempt > 0 or not hand.empty
@@ -421,7 +391,14 @@ def carry(
         support: name of the support, ignored as an obstacle.
     """
 
-    at = _hand_over(hand, held, destination, turn)
+    def at(height: float) -> Target:
+        def target() -> Array:
+            # Use the present pose in the hand: the object may have turned or slipped since the grasp.
+            position, rotation = hand.sim.eef_pose()
+            now, _ = hand.sim.asset_pose(held.name)
+            return destination() - turn @ rotation.T @ (now - position) + height * UP
+
+        return target
 
     def lost() -> bool:
         return not is_held(hand, held)
@@ -446,22 +423,6 @@ def carry(
         tipped = support in hand.sim.assets and hand.sim.asset_pose(support)[1][2, 2] < LEVEL_COSINE
         if not tipped and length((hand.position - at(0.0)())[:2]) < MAX_RELEASE_OFFSET:
             return  # otherwise a push moved the hand aside: over the rim of a bowl, or in the air
-
-
-def _hand_over(hand: Hand, held: Held, destination: Target, turn: Array) -> Callable[[float], Target]:
-    """Return a function from height above the destination, m, to the hand's target position."""
-
-    def at(height: float) -> Target:
-        def target() -> Array:
-            # Use the present pose in the hand: the object may have turned or slipped since the grasp.
-            position, rotation = hand.sim.eef_pose()
-            now, _ = hand.sim.asset_pose(held.name)
-            offset = turn @ rotation.T @ (now - position)
-            return destination() - offset + height * UP
-
-        return target
-
-    return at
 
 
 def _upright(hand: Hand, held: Held) -> Array:

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.sim.controller import POSITION_SCALE, ROTATION_SCALE
-from lerobot_memobench.sim.robot import ARM_JOINTS
+from lerobot_memobench.sim.robot import ARM_JOINTS, POSITION_SCALE, ROTATION_SCALE
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.task import STRICT
 
@@ -94,16 +93,10 @@ def downward(yaw: float) -> Array:
 
 
 class Hand:
-    """Compute actions that move the arm to targets.
-
-    Args:
-        sim: running simulation.
-        rng: random source of the episode's speed and smoothness.
-    """
+    """Compute actions that move the arm of a running simulation to targets; speed and smoothness are random."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
-        self.sim = sim
-        self.rng = rng
+        self.sim, self.rng = sim, rng
         self.strict = sim.task.suite == STRICT
         """Whether the task is strict; published tasks keep the motions of their published demonstrations."""
         self.speed = float(rng.uniform(0.62, 0.82))
@@ -169,8 +162,7 @@ class Hand:
     def error(self, position: Array, rotation: Array) -> tuple[float, float]:
         """Return the distance to a pose, m and rad."""
         here, turned = self.sim.eef_pose()
-        angle = length(rotation_vector(rotation @ turned.T))
-        return length(position - here), angle
+        return length(position - here), length(rotation_vector(rotation @ turned.T))
 
     def move(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,10 +89,9 @@ def opening_direction(hand: Hand, articulation: Articulation) -> Array:
 
 def drawer_containing(hand: Hand, name: str) -> str | None:
     """Return the region of the drawer that contains an object, None without one."""
-    for asset in hand.sim.assets.values():
-        for region, articulation in asset.articulations.items():
-            if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, asset.regions[region]))):
-                return asset.regions[region]
+    for region, (articulation, _) in hand.sim.world.joints.items():
+        if articulation.kind == "drawer" and hand.sim.holds(Atom("in", (name, region))):
+            return region
     return None
 
 
@@ -131,25 +130,25 @@ def obstacle_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
         boxes.append((position + rotation @ (low + high) / 2, rotation, (high - low) / 2))
         for region, articulation in asset.articulations.items():
             if articulation.kind == "drawer":
-                boxes.append(_drawer_box(hand, asset.regions[region], articulation.handle_site))
+                centre, turned, half = region_box(hand, asset.regions[region])
+                handle, _ = hand.sim.site_pose(articulation.handle_site)
+                reach = np.abs(turned.T @ (handle - centre)) + 0.008
+                boxes.append((centre, turned, np.maximum(half + 0.012, reach)))
     return boxes
 
 
-def _drawer_box(hand: Hand, region: str, handle_site: str) -> tuple[Array, Array, Array]:
-    centre, turned, half = region_box(hand, region)
-    handle, _ = hand.sim.site_pose(handle_site)
-    reach = np.abs(turned.T @ (handle - centre)) + 0.008
-    return centre, turned, np.maximum(half + 0.012, reach)
+def _objects(hand: Hand, *but: str) -> Iterator[tuple[Asset, Array, Array]]:
+    """Yield objects with their positions (3,) and rotations (3, 3), except those of some names."""
+    for name, asset in hand.sim.assets.items():
+        if asset.kind == "object" and name not in but:
+            yield asset, *hand.sim.asset_pose(name)
 
 
 def hand_penetration(hand: Hand, name: str, target: Array, turn: Array, margin: float = HAND_MARGIN) -> float:
     """Return the largest penetration of palm and wrist into other objects for a grasp, m; 0 without collision."""
     points = target + HAND_POINTS @ turn.T
     deepest = 0.0
-    for other, asset in hand.sim.assets.items():
-        if asset.kind == "fixture" or other == name:
-            continue
-        position, rotation = hand.sim.asset_pose(other)
+    for asset, position, rotation in _objects(hand, name):
         low, high = np.asarray(asset.low), np.asarray(asset.high)
         local = (points - position) @ rotation - (low + high) / 2
         depth = ((high - low) / 2 + margin - np.abs(local)).min(axis=1)
@@ -161,42 +160,29 @@ def finger_obstruction_cost(hand: Hand, name: str, target: Array, turn: Array) -
     """Return a cost for other objects below the open fingers."""
     penalty = 0.0
     apart = OPEN_WIDTH / 2 + FINGER_THICKNESS / 2
-    for other, asset in hand.sim.assets.items():
-        if other == name or asset.kind == "fixture":
-            continue
-        position, rotation = hand.sim.asset_pose(other)
+    for asset, position, rotation in _objects(hand, name):
         if position[2] + asset.top < target[2] - FINGER_REACH:
             continue
         for side in (-1.0, 1.0):
-            gap = _gap(asset, rotation.T @ (target + side * apart * turn[:, 0] - position))
+            finger = rotation.T @ (target + side * apart * turn[:, 0] - position)
+            outside = np.maximum(np.abs(finger[:2]) - np.asarray(asset.half_extents), 0.0)
+            gap = float(np.hypot(*finger[:2])) - asset.radius if asset.round else float(np.hypot(*outside))
             penalty += 40.0 * max(0.0, FINGER_THICKNESS - gap) + BLOCKED_COST * (gap < BLOCKED_DISTANCE)
     return penalty
 
 
-def _gap(asset: Asset, local: Array) -> float:
-    """Return the horizontal distance of a point in an asset's frame from its outline, m; at most 0 inside."""
-    if asset.round:
-        return float(np.hypot(local[0], local[1])) - asset.radius
-    outside = np.maximum(np.abs(local[:2]) - np.asarray(asset.half_extents), 0.0)
-    return float(np.hypot(*outside))
-
-
-def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: float, but: tuple[str, ...]) -> float:
+def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: float, but: Iterable[str]) -> float:
     """Return the height of the hand for a collision-free horizontal path, m; 0 without obstacles.
 
     Args:
         hand: controlled arm.
         start, end: end points of the path, (3,).
-        lowest: extent of hand and load below the grip site, m.
-        wide: lateral extent of hand and load, m.
+        lowest, wide: extent of hand and load below the grip site, and lateral extent, m.
         but: names to ignore: the carried or grasped object and its support.
     """
     way = start + np.linspace(0.0, 1.0, 16)[:, None] * (end - start)
     height = 0.0
-    for other, asset in hand.sim.assets.items():
-        if asset.kind == "fixture" or other in but:
-            continue
-        position, rotation = hand.sim.asset_pose(other)
+    for asset, position, rotation in _objects(hand, *but):
         gap = float(np.linalg.norm((way - position)[:, :2], axis=1).min()) - asset.radius - wide
         if gap < 0.0:
             height = max(height, float(position[2] + (rotation @ corners(asset))[2].max()))
@@ -226,17 +212,17 @@ def clear_of_objects(
     are tried, rad.
     """
     side = cross(UP, closing)
-    best, least = leaned_rotation(closing, away), np.inf
+    best, least_cost = leaned_rotation(closing, away), np.inf
     for more in (largest / MAX_LEAN * candidate for candidate in LEAN_CANDIDATES):
         if abs(float(away @ side) + more) > largest and more != 0.0:
             continue
         turn = leaned_rotation(closing, away + more * side)
-        bad = hand_penetration(hand, name, target, turn)
+        cost = hand_penetration(hand, name, target, turn)
         if reaching:
-            bad += max(0.0, hand.stretch(target, turn) - MAX_STRETCH)
-        if bad < least - 0.002:
-            best, least = turn, bad
-        if least <= 0.0:
+            cost += max(0.0, hand.stretch(target, turn) - MAX_STRETCH)
+        if cost < least_cost - 0.002:
+            best, least_cost = turn, cost
+        if least_cost <= 0.0:
             break
     return best
 
@@ -265,27 +251,20 @@ def lean_from_fixtures(hand: Hand, name: str, target: Array) -> Array:
     lean = np.zeros(3)
     for centre, rotation, half in obstacle_boxes(hand, name):
         local = rotation.T @ (target - centre)
-        if local[2] + 0.03 <= half[2]:
-            lean += _lean_from_obstacle(local, rotation, half)
+        outside = local - np.clip(local, -half, half)
+        outside[2] = 0.0
+        gap = length(outside)
+        if local[2] + 0.03 > half[2] or gap >= OBSTACLE_DISTANCE:
+            continue
+        if gap > 1e-6:
+            lean += rotation @ outside / gap * MAX_LEAN * min(1.0, 1.6 * (1.0 - gap / OBSTACLE_DISTANCE))
+        else:  # below the box, such as an open drawer: approach from the nearest side
+            side = int(np.argmin(half[:2] - np.abs(local[:2])))
+            way = np.zeros(3)
+            way[side] = np.sign(local[side]) or 1.0
+            lean += rotation @ way * MAX_LEAN_UNDER
     size = length(lean)
     return lean * min(1.0, MAX_LEAN_UNDER / size) if size > 0 else lean
-
-
-def _lean_from_obstacle(local: Array, rotation: Array, half: Array) -> Array:
-    """Return the lean (3,) away from one box; ``local`` (3,) is the target in the box's frame."""
-    outside = local - np.clip(local, -half, half)
-    outside[2] = 0.0
-    gap = length(outside)
-    if gap >= OBSTACLE_DISTANCE:
-        return np.zeros(3)
-    if gap > 1e-6:
-        return rotation @ outside / gap * MAX_LEAN * min(1.0, 1.6 * (1.0 - gap / OBSTACLE_DISTANCE))
-    # Below the box, such as an open drawer: approach from the nearest side.
-    room = half[:2] - np.abs(local[:2])
-    side = int(np.argmin(room))
-    way = np.zeros(3)
-    way[side] = np.sign(local[side]) or 1.0
-    return rotation @ way * MAX_LEAN_UNDER
 
 
 def distance_from_base(place: Array) -> float:
@@ -350,8 +329,12 @@ def travel(
 ) -> Steps:
     """Move above a position, over all obstacles on the path; a free path needs no motion."""
     start, end = hand.position, place()
-    lowest, wide, but = _carried_extent(hand, held)
-    height = clear_height(hand, start, end, lowest=lowest, wide=wide, but=(target, *but))
+    lowest, wide, but = FINGER_REACH, HAND_HALF_WIDTH, [target]
+    if held is not None:
+        asset, (position, rotation) = hand.sim.assets[held.name], hand.sim.asset_pose(held.name)
+        below = float(start[2] - position[2] - (rotation @ corners(asset))[2].min())
+        lowest, wide, but = max(lowest, below), max(wide, asset.radius), [target, held.name]
+    height = clear_height(hand, start, end, lowest=lowest, wide=wide, but=but)
     if height <= min(start[2], end[2]) + 0.01:
         return
     if start[2] < height - 0.01:
@@ -365,16 +348,6 @@ def travel(
         return np.array([end[0], end[1], max(end[2], height)])
 
     yield from hand.move(over, turned, gripper, tolerance=0.02, turn_tolerance=0.15, give_up=give_up)
-
-
-def _carried_extent(hand: Hand, held: Held | None) -> tuple[float, float, tuple[str, ...]]:
-    """Return the downward and lateral extent of hand and load, m, and the load's name if any."""
-    if held is None:
-        return FINGER_REACH, HAND_HALF_WIDTH, ()
-    asset = hand.sim.assets[held.name]
-    position, rotation = hand.sim.asset_pose(held.name)
-    below = float(hand.position[2] - position[2] - (rotation @ corners(asset))[2].min())
-    return max(FINGER_REACH, below), max(HAND_HALF_WIDTH, asset.radius), (held.name,)
 
 
 def release_fixture(hand: Hand, height: float = 0.12) -> Steps:

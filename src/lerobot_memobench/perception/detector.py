@@ -98,14 +98,7 @@ class DetectorOutput:
 
 
 class Detector(nn.Module):
-    """Visual encoder, feature pyramid and heads.
-
-    Args:
-        encoder: makes the tokens. kinds: names of the kinds of objects.
-
-    Attributes:
-        fine_heads: read the finest map of the pyramid. refinement_head: scores the peaks of its heat map.
-    """
+    """Visual encoder, feature pyramid, heads on its finest map, and a head that scores the peaks of the heat map."""
 
     def __init__(self, encoder: VisualEncoder, kinds: tuple[str, ...]) -> None:
         super().__init__()
@@ -139,7 +132,7 @@ class FeaturePyramid(nn.Module):
         self.levels = nn.ModuleList(PyramidLevel(*pair) for pair in pairwise(widths))
 
     def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
-        """Return (N, (GRID FINER)², width), row by row, of tokens (N, 64, encoder's width) and feature maps."""
+        """Return (N, (GRID FINER)², width), row by row."""
         x = tokens.unflatten(1, (GRID, GRID))
         for level, lateral in zip(self.levels, reversed(maps), strict=False):
             x = level(x, lateral)
@@ -147,11 +140,7 @@ class FeaturePyramid(nn.Module):
 
 
 class PyramidLevel(nn.Module):
-    """Map a coarse map and the encoder's feature map, twice as fine, to a finer map.
-
-    Args:
-        coarse, lateral: channels of the two.
-    """
+    """Map a coarse map and the encoder's feature map, twice as fine, to a finer map; arguments are their channels."""
 
     def __init__(self, coarse: int, lateral: int) -> None:
         super().__init__()
@@ -170,8 +159,7 @@ class Heads(nn.Module):
     """Linear maps from tokens, or cells of a map, to a `DetectorOutput`.
 
     Args:
-        width: of a token. kinds: number of kinds of objects. grid: side of the square of tokens.
-        fine, coarse: cells along a token's side. uncertain: predict the geometry's expected errors too.
+        width: of a token. grid: side of the square of tokens. fine, coarse: cells along a token's side.
     """
 
     def __init__(
@@ -200,7 +188,6 @@ class Heads(nn.Module):
         )
 
     def _query(self, linear: nn.Linear, tokens: Tensor, values: int) -> CellQuery:
-        """Return a query of a linear map that predicts so many values of each kind in each coarse cell."""
         c, layout = self.coarse, "(k v y x) ... -> (k y x) v ..."
         weight, bias = (rearrange(part, layout, v=values, y=c, x=c) for part in (linear.weight, linear.bias))
 
@@ -213,7 +200,6 @@ class Heads(nn.Module):
         return query
 
     def _as_map(self, values: Tensor) -> Tensor:
-        """Arrange each token's fine cells as a map (N, values, cells, cells), float32."""
         sides = {"gy": self.grid, "gx": self.grid, "y": self.fine, "x": self.fine}
         return rearrange(values.float(), "n (gy gx) (v y x) -> n v (gy y) (gx x)", **sides)
 
@@ -222,7 +208,7 @@ class RefinementHead(nn.Module):
     """Score the peaks of a heat map by their surroundings.
 
     Args:
-        width: of the finest map. channels: of the encoder's feature map, twice as fine. kinds: number of kinds.
+        width: of the finest map. channels: of the encoder's feature map, twice as fine.
     """
 
     def __init__(self, width: int, channels: int, kinds: int) -> None:
@@ -235,12 +221,7 @@ class RefinementHead(nn.Module):
         self.score = nn.Linear(REFINEMENT_WIDTH, kinds)
 
     def forward(self, fine: Tensor, maps: Tensor, heatmap: Tensor) -> CellQuery:
-        """Return a query of scores: a logit per kind of an object in a cell of the finest map.
-
-        Args:
-            fine: (N, side², width) the finest map. maps: (N, channels, 2 side, 2 side) the encoder's.
-            heatmap: (N, kinds, side, side) logits.
-        """
+        """Return a query of scores: a logit per kind of an object in a cell of the finest map (N, side², width)."""
         grid = fine.unflatten(1, heatmap.shape[-2:]).permute(0, 3, 1, 2)
 
         def query(image: Tensor, _: Tensor, row: Tensor, column: Tensor) -> Tensor:
@@ -256,11 +237,7 @@ class RefinementHead(nn.Module):
 
 
 def _squares(maps: Tensor, side: int, step: int) -> Tensor:
-    """Return the squares around every ``step``-th cell of maps (N, C, H, W), zero-padded.
-
-    Returns:
-        (N, C, H / step, W / step, side, side).
-    """
+    """Return zero-padded squares around every ``step``-th cell of maps (N, C, H, W), (N, C, H', W', side, side)."""
     return pad(maps.float(), (side // 2,) * 4).unfold(2, side, step).unfold(3, side, step)
 
 
@@ -273,16 +250,21 @@ def detections(output: DetectorOutput) -> list[Detections]:
     scores, order = scores.sort(dim=1, descending=True, stable=True)
     which, rank = torch.nonzero(scores > (MIN_HEAT if output.score is None else MIN_SCORE), as_tuple=True)
     image, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
+
+    def in_image(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
+        """Query geometry with places in the image, fractions of its side, instead of offsets from cells."""
+        offset, rest = output.geometry(image, kind, row, column).split([2, len(GEOMETRY) - 2], dim=1)
+        return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / output.side, rest], dim=1)
+
     side = output.heatmap.shape[-1]
     there = (image, kind, (row + 0.5) / side, (column + 0.5) / side)
-    geometry = _interpolated(_geometry_in_image(output), output.side, *there)
+    geometry = _interpolated(in_image, output.side, *there)
     found = np.zeros(len(image), DETECTION)
     found["kind"], found["score"] = kind.numpy(), scores[which, rank].detach().numpy()
-    found["place"] = geometry[:, :2]
+    found["place"], found["turn"] = geometry[:, :2], geometry[:, -2:]
     for name in ("depth", "height", "joint"):
         found[name] = geometry[:, GEOMETRY.index(name)]
     found["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
-    found["turn"] = geometry[:, -2:]
     if output.uncertainty is not None:
         found["uncertainty"] = np.exp(_interpolated(output.uncertainty, output.side, *there)) / [output.side, 1, 1]
     owner = image.numpy()
@@ -305,16 +287,6 @@ def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor,
         refined = torch.sigmoid(logits.gather(2, cells[1][..., None])[..., 0])
         scores = torch.where(scores > 0, refined, scores)
     return scores, cells
-
-
-def _geometry_in_image(output: DetectorOutput) -> CellQuery:
-    """Return a query of geometry with places in the image, fractions of its side, instead of offsets from cells."""
-
-    def query(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        offset, rest = output.geometry(image, kind, row, column).split([2, len(GEOMETRY) - 2], dim=1)
-        return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / output.side, rest], dim=1)
-
-    return query
 
 
 def _interpolated(

@@ -14,21 +14,36 @@ from math import pi
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from lerobot_memobench.perception.detector import Detections, Detector, detections
-from lerobot_memobench.perception.geometry import View, depth_at_height, rays, views_of
 from lerobot_memobench.perception.visual_encoder import resized
-from lerobot_memobench.sim.asset import TABLE_TOP
-from lerobot_memobench.sim.libero.classes import CLASSES
-from lerobot_memobench.sim.libero.placement import sample_orientation
-from lerobot_memobench.sim.libero.scene import UNKNOWN_CLASS
+from lerobot_memobench.sim.asset import (
+    AGENTVIEW_ANGLE,
+    AGENTVIEW_POSITION,
+    AGENTVIEW_QUATERNION,
+    CLASSES,
+    TABLE_TOP,
+    UNKNOWN_CLASS,
+)
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
-from lerobot_memobench.sim.object_slots import classes, fill_slots, rotation
+from lerobot_memobench.sim.object_slots import classes, fill_slots
+from lerobot_memobench.sim.placement import quaternion_matrix, sample_orientation
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 
 Array = NDArray[np.float64]
+View = Mapping[str, Array] | NDArray[np.void]
+"""One camera, or (...) of them: ``eye`` (..., 3) its position, m; ``turned`` (..., 3, 3) its rotation, it looks along
+-z; ``slope`` (...) tangent of half its field of view."""
+
+WRIST_POSITION = (0.05, 0.0, -0.097)
+"""The wrist camera's position in the hand's frame, from between the finger tips, m."""
+WRIST_ROTATION = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""Its rotation in the hand's frame."""
+ANGLES = {"agentview": AGENTVIEW_ANGLE, "wrist": 75.0}
+"""Fields of view, degrees."""
 
 DRAWERS = ("top_drawer", "middle_drawer", "bottom_drawer")
 """Each drawer is a kind of its own: drawers are closer together than two objects of one kind that can be separated."""
@@ -52,15 +67,56 @@ LEAST_ERROR = 0.0005
 """Lower bound of expected errors of positions, m."""
 
 
+# -- geometry of the cameras -------------------------------------------------------------------------------------------
+
+
+def views_of(state: NDArray[np.floating]) -> dict[str, View]:
+    """Return the views of both cameras for a robot state (>= 6,): the hand's position and axis-angle rotation."""
+    slope = {camera: np.tan(np.radians(angle) / 2) for camera, angle in ANGLES.items()}
+    fixed = Rotation.from_quat(AGENTVIEW_QUATERNION, scalar_first=True).as_matrix()
+    hand = Rotation.from_rotvec(np.asarray(state[3:6], np.float64)).as_matrix()
+    eye = state[:3] + hand @ np.array(WRIST_POSITION)
+    return {
+        "agentview": {"eye": np.array(AGENTVIEW_POSITION), "turned": fixed, "slope": slope["agentview"]},
+        "wrist": {"eye": eye, "turned": hand @ np.array(WRIST_ROTATION), "slope": slope["wrist"]},
+    }
+
+
+def projected(positions: Array, view: View) -> tuple[Array, Array]:
+    """Project points (..., 3) of the world: places (..., 2) in the image, and depths (...) along the view, m.
+
+    Places are fractions of the image's side, x to the right and y down, from its upper left corner.
+    """
+    local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
+    depth = -local[..., 2]
+    reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
+    return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
+
+
+def rays(places: Array, view: View) -> Array:
+    """Return the lines of sight (..., 3) in the world through places (..., 2), of depth one along the camera's view."""
+    slope = np.asarray(view["slope"])
+    across, up = (2 * places[..., 0] - 1) * slope, (1 - 2 * places[..., 1]) * slope
+    local = np.stack([across, up, -np.ones_like(across)], axis=-1)
+    return np.asarray(np.einsum("...ij,...j->...i", view["turned"], local))
+
+
+def depth_at_height(sight: Array, height: Array, view: View) -> Array:
+    """Return the depth (...) at which lines of sight (..., 3) meet a height; very large if they point up."""
+    return np.asarray((height - view["eye"][2]) / np.minimum(sight[..., 2], -1e-3))
+
+
+# -- objects -----------------------------------------------------------------------------------------------------------
+
+
 @dataclass
 class DetectedObject:
     """An object, by the detections of one camera or of both.
 
     Attributes:
-        cameras: that detected it. depth: from the camera that placed it, m.
-        position: of its origin in the world, m. precision: (3, 3) inverse covariance of the position, 1/m².
-        axis: (3,) its x axis or the opposite one, level. joint: m or rad.
-        lit: probability of a highlight around it.
+        depth: from the camera that placed it, m. position: of its origin in the world, m.
+        precision: (3, 3) inverse covariance of the position, 1/m². axis: (3,) its x axis or the opposite one, level.
+        joint: m or rad. lit: probability of a highlight around it.
     """
 
     kind: int
@@ -91,10 +147,7 @@ class DetectedObject:
 
 
 class ObjectLocalizer:
-    """Detect objects in both cameras' images and place them in the world.
-
-    Kinds that this version does not know are ignored.
-    """
+    """Detect objects in both cameras' images and place them in the world; kinds without a class are ignored."""
 
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
@@ -107,7 +160,7 @@ class ObjectLocalizer:
         """Return object slots (N, `object_slots.SIZE`), float32.
 
         Args:
-            images: of each camera, `agentview` and `wrist`, (N, 3, H, H) in [0, 1].
+            images: of each camera, (N, 3, H, H) in [0, 1].
             states: (N, >= 6) the hand's position, m, and its rotation as axis times angle, rad.
         """
         both = torch.cat([resized(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
@@ -146,14 +199,12 @@ class ObjectLocalizer:
         return [one for one in objects if len(one.cameras) > 1 or one.score > MIN_SCORE_ALONE]
 
     def _same(self, known: DetectedObject, new: DetectedObject) -> bool:
-        """Return whether two detections are of one object."""
         if known.kind != new.kind or self._one[new.kind]:
             return known.kind == new.kind
         apart = APART if new.cameras[0] in known.cameras else SAME
         return float(np.linalg.norm(known.position - new.position)) < apart
 
     def _located(self, camera: str, view: View, detection: np.void) -> DetectedObject:
-        """Return a camera's detection in the world."""
         sight, turned = rays(detection["place"].astype(np.float64), view), np.asarray(view["turned"])
         angle = np.arctan2(detection["turn"][1], detection["turn"][0]) / 2
         axis = np.cos(angle) * turned[:, 0] + np.sin(angle) * turned[:, 1]
@@ -210,6 +261,6 @@ def _classes() -> Tensor:
     rows = []
     for name in classes():
         known = CLASSES.get(name, UNKNOWN_CLASS)
-        placed = rotation(sample_orientation(known.turns, np.random.RandomState(0)))[:, 0]
+        placed = quaternion_matrix(sample_orientation(known.turns, np.random.RandomState(0)))[:, 0]
         rows.append([FACING.get(name, np.arctan2(placed[1], placed[0])), known.round, known.y_up])
     return torch.tensor(rows)

@@ -74,7 +74,7 @@ class VisualEncoder(nn.Module):
         self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = BLOCKS, *, folded: bool = False
     ) -> None:
         super().__init__()
-        self.widths, self.blocks = widths, blocks
+        self.widths, self.blocks, self.width = widths, blocks, widths[-1]
         self.stages = nn.ModuleList(
             nn.Sequential(ConvNorm(here, there, stride=2), nn.ReLU(), *(ResidualBlock(there) for _ in range(count)))
             for here, there, count in zip((3, *widths[:-1]), widths, blocks, strict=True)
@@ -84,11 +84,6 @@ class VisualEncoder(nn.Module):
         self.pool = nn.Linear(widths[-1] * (GRID // POOLED) ** 2, widths[-1])
         if folded:
             self.fold()
-
-    @property
-    def width(self) -> int:
-        """Dimension of a token."""
-        return self.widths[-1]
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the tokens (N, 64, width) of images (N, 3, SIDE, SIDE) in [0, 1], row by row."""

@@ -20,8 +20,8 @@ logger = logging.getLogger(__name__)
 
 SHIPPED = Path(__file__).parent / "detector.safetensors"
 """The detector that comes with the package, trained on the scenes that version 0.2 modelled in code."""
-PACKAGE, RANDOM = "package", "random"
-"""Names that do not mean a file: the package's detector, and a visual encoder with random weights."""
+PACKAGE = "package"
+"""Name of the package's detector."""
 
 
 def save_detector(detector: Detector, path: Path) -> None:
@@ -33,7 +33,7 @@ def save_detector(detector: Detector, path: Path) -> None:
 
 
 def load_detector(name: str | Path) -> Detector:
-    """Return the detector of a name, `PACKAGE` or a path, in float32 and in evaluation mode; warn about the package's.
+    """Return the detector of `PACKAGE` or a path in float32 and in evaluation mode; warn about the package's.
 
     Raises:
         MemobenchError: the file does not exist, or `save_detector` did not write it.
@@ -46,7 +46,7 @@ def load_detector(name: str | Path) -> Detector:
             shape = json.loads(file.metadata()["detector"])
             detector = Detector(VisualEncoder(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
             detector.fold()
-            # Files of earlier versions also hold heads that only training used.
+            # The package's file also holds heads that only its training used.
             detector.load_state_dict({key: file.get_tensor(key).float() for key in detector.state_dict()})
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
@@ -66,11 +66,7 @@ def warn_of_former_scenes() -> None:
 
 
 def load_visual_encoder(name: str) -> VisualEncoder:
-    """Return the visual encoder of the detector of a name, `PACKAGE` or a path, as policies use it.
-
-    Raises:
-        MemobenchError: the file does not exist, or its encoder has other sizes than this version's.
-    """
+    """Return the visual encoder of the detector of `PACKAGE` or a path; refuse one of other sizes than policies use."""
     encoder = load_detector(name).encoder
     if (encoder.widths, encoder.blocks) != (WIDTHS, BLOCKS):
         raise MemobenchError(
@@ -81,11 +77,7 @@ def load_visual_encoder(name: str) -> VisualEncoder:
 
 
 def detector_file(name: str | Path) -> Path:
-    """Return the file of the detector of a name, `PACKAGE` or a path.
-
-    Raises:
-        MemobenchError: it does not exist.
-    """
+    """Return the file of the detector of `PACKAGE` or a path; refuse one that does not exist."""
     path = SHIPPED if str(name) == PACKAGE else Path(name).expanduser()
     if not path.is_file():
         raise MemobenchError(f"there is no file {path}; name one that `python -m research.detector train` has written")

@@ -1,1 +1,1 @@
-"""Who learns it? The memory policy and the expert, as LeRobot policies."""
+"""The memory policy, policies in servers and baselines as LeRobot policies; checkpoints and their checks."""

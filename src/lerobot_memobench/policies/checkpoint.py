@@ -1,7 +1,8 @@
 """Find checkpoints of trained policies, and check that they are complete, of the expected type, and name no code.
 
 LeRobot imports and calls any ``class`` that a checkpoint's processor names, so its steps are checked before it builds
-them.
+them. Each check raises `MemobenchError`. A source is a checkpoint folder, or a repository, whose files are fetched when
+they are read.
 """
 
 from __future__ import annotations
@@ -48,37 +49,32 @@ SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
 
 
-class Feature(TypedDict, total=False):
-    """A column that is normalised."""
+# --- the parts of LeRobot's files that are read ---
 
+
+class _Feature(TypedDict, total=False):
     type: str
 
 
-class StepConfig(TypedDict, total=False):
-    """Settings of a normalising or a renaming step."""
-
+class _StepConfig(TypedDict, total=False):
     norm_map: dict[str, str]
-    features: dict[str, Feature]
+    features: dict[str, _Feature]
     rename_map: dict[str, str]
 
 
-class Step(TypedDict, total=False):
-    """A step of a processor, as LeRobot saves it."""
+class SavedStep(TypedDict, total=False):
+    """A step of a processor; ``config`` of those that normalise or rename."""
 
     registry_name: str
     state_file: str | None
-    config: StepConfig
+    config: _StepConfig
 
 
-class Processor(TypedDict, total=False):
-    """A processor's file."""
-
-    steps: list[Step]
+class _Processor(TypedDict, total=False):
+    steps: list[SavedStep]
 
 
-class TrainedOn(TypedDict, total=False):
-    """LeRobot's settings of the dataset of a training run."""
-
+class _TrainedOn(TypedDict, total=False):
     repo_id: str | None
     revision: str | None
     root: str | None
@@ -86,19 +82,19 @@ class TrainedOn(TypedDict, total=False):
 
 
 class TrainConfig(TypedDict):
-    """The parts of a checkpoint's ``train_config.json`` that are read."""
+    """A checkpoint's ``train_config.json``."""
 
-    dataset: TrainedOn
+    dataset: _TrainedOn
     steps: NotRequired[Count | None]
     rename_map: NotRequired[dict[str, str] | None]
 
 
-def looks_local(text: str) -> bool:
-    """Return whether a name is a path of this machine and not a repository ``user/name``.
+# --- finding checkpoints ---
 
-    Paths begin with ``.``, ``/``, ``~`` or ``outputs/``, end with a slash or have several. Another folder does not make
-    ``lerobot/act`` a path: many users have a copy of LeRobot in the current folder.
-    """
+
+def looks_local(text: str) -> bool:
+    """Return whether a name is a path of this machine and not a repository ``user/name``."""
+    # A folder of that name does not make lerobot/act a path: many users have a copy of LeRobot in the current folder.
     return text.startswith((".", "/", "~", "outputs/")) or text.count("/") > 1 or text.endswith("/")
 
 
@@ -108,18 +104,15 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def checkpoint_folder(text: str) -> Path | None:
-    """Return the checkpoint of a name or path; None if there is none.
+    """Return the folder of a shipped policy, of a checkpoint, or of the last one of a training run; None without one.
 
-    A name is that of a policy that comes with the package, a path that of a checkpoint or a training run, whose last
-    checkpoint is returned. If both exist, ``./name`` is the path.
+    If a shipped policy and a folder have the same name, ``./name`` is the folder.
     """
     if text in (shipped := shipped_policies()):
         return shipped[text]
     base = _through_last(Path(text).expanduser())
-    for folder in (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base)))):
-        if (folder / CONFIG_FILE).is_file():
-            return folder
-    return None
+    folders = (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base))))
+    return next((folder for folder in folders if (folder / CONFIG_FILE).is_file()), None)
 
 
 def checkpoints_of(run: Path) -> list[Path]:
@@ -135,11 +128,11 @@ def checkpoints_of(run: Path) -> list[Path]:
 
 
 def _through_last(path: Path) -> Path:
-    """Replace ``checkpoints/last`` in a path by the checkpoint that the link named, if a copy lost the link."""
+    """Replace ``checkpoints/last`` in a path by the checkpoint that it named, if a copy lost the link."""
     for last in (path, path.parent):
         if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
-            found = checkpoints_of(last.parent.parent)
-            return found[0] / path.relative_to(last) if found else path
+            checkpoints = checkpoints_of(last.parent.parent)
+            return checkpoints[0] / path.relative_to(last) if checkpoints else path
     return path
 
 
@@ -170,32 +163,31 @@ def cached_folder(repository: str) -> Path | None:
     return Path(cached).parent if isinstance(cached, str) else None
 
 
-def checkpoint_type(path: str) -> str | None:
-    """Return the policy type of a checkpoint folder; None for a repository.
+# --- reading checkpoints ---
 
-    Raises:
-        MemobenchError: the folder does not exist, or its configuration names no type.
-    """
-    folder = Path(path).expanduser()
-    if not folder.is_dir():
-        if looks_local(path):
-            raise MemobenchError(f"the checkpoint folder {path} does not exist")
-        return None
-    name = read_json(folder / CONFIG_FILE).get("type")
+
+def checkpoint_settings(path: str) -> dict[str, Any]:
+    """Return the settings in the configuration of a source, or raise `MemobenchError`."""
+    if not Path(path).expanduser().is_dir() and looks_local(path):
+        raise MemobenchError(f"the checkpoint folder {path} does not exist")
+    if (file := checkpoint_file(path, CONFIG_FILE)) is None:
+        raise MemobenchError(f"{path} holds no {CONFIG_FILE}; expected a complete checkpoint as lerobot-train saves it")
+    return read_json(file)
+
+
+def checkpoint_type(path: str) -> str:
+    """Return the policy type of a source, or raise `MemobenchError`."""
+    name = checkpoint_settings(path).get("type")
     if not isinstance(name, str):
         raise MemobenchError(
-            f"{folder / CONFIG_FILE} names no policy type; LeRobot cannot read checkpoints of its first year: train "
-            "the policy again"
+            f"{Path(path) / CONFIG_FILE} names no policy type; LeRobot cannot read checkpoints of its first year: "
+            "train the policy again"
         )
     return name
 
 
 def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
-    """Return the object in a JSON file.
-
-    Raises:
-        MemobenchError: the file is missing, or does not fit the schema.
-    """
+    """Return the object in a JSON file of a checkpoint; raise `MemobenchError` if it is missing, or not of a schema."""
     try:
         content: dict[str, Any] = read_json_file(path, schema, ADVICE)
     except FileNotFoundError:
@@ -206,13 +198,10 @@ def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
 
 
 def check_checkpoint(path: str) -> None:
-    """Refuse a checkpoint folder that cannot act as it was trained.
-
-    Raises:
-        MemobenchError: weights, processors or normalisation statistics are missing.
-    """
+    """Refuse a source without weights, trusted processors or normalisation statistics."""
     folder = Path(path).expanduser()
-    if checkpoint_type(path) is not None:  # else a repository: LeRobot fetches these files
+    if folder.is_dir() or looks_local(path):  # else a repository: LeRobot fetches these files
+        checkpoint_type(path)
         if not any((folder / name).is_file() for name in (WEIGHTS_FILE, ADAPTER_FILE)):
             raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
         for weights in folder.glob("*.safetensors"):
@@ -221,28 +210,10 @@ def check_checkpoint(path: str) -> None:
     check_processors(path)
 
 
-def check_registered(path: str) -> None:
-    """Refuse a checkpoint, a folder or a repository, of a policy type that no imported package registers."""
-    from lerobot.configs.policies import PreTrainedConfig
-
-    kind = _type_of(path)
-    if kind is not None and kind not in PreTrainedConfig.get_known_choices():
-        raise MemobenchError(
-            f"the checkpoint {path} is of policy type '{kind}', which no installed package registers; install the "
-            "package that trained it"
-        )
-
-
 def check_statistics(source: str | Path, revision: str | None = None) -> None:
     """Refuse processors without the statistics of the training data.
 
     Their policy would run on raw numbers and score 0 % without any message.
-
-    Args:
-        source: a checkpoint folder, or a repository, whose processor files are fetched now.
-
-    Raises:
-        MemobenchError: a processor or a statistic is missing.
     """
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = checkpoint_file(source, name, revision)
@@ -252,60 +223,51 @@ def check_statistics(source: str | Path, revision: str | None = None) -> None:
                 f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {source}"
             )
         for step in filter(_normalises, steps_of(file)):
-            _check_statistics(source, file, step, revision)
+            state = step.get("state_file")
+            known: dict[str, Any] = {}
+            if state is not None:
+                path = checkpoint_file(source, file_name(state, f"state_file in {file}"), revision)
+                if path is None:
+                    raise MemobenchError(
+                        f"the checkpoint {source} lacks its normalisation statistics ({state} is missing); copy the "
+                        "whole checkpoint or train it again"
+                    )
+                known = _shapes(path)
+            missing = [key for key in _normalised(step, name) if not any(one.startswith(f"{key}.") for one in known)]
+            if missing:
+                raise MemobenchError(
+                    f"the checkpoint {source} has no normalisation statistics for {', '.join(missing)} "
+                    f"({state or name}), and would act on raw numbers; copy the whole checkpoint or train it again"
+                )
 
 
-def _check_statistics(source: str | Path, file: Path, step: Step, revision: str | None) -> None:
+def _normalised(step: SavedStep, processor: str) -> Iterator[str]:
     config = step.get("config", {})
     modes = config.get("norm_map", {})
-    needed = [
-        key
-        for key, feature in config.get("features", {}).items()
-        if str(modes.get(str(feature.get("type")), "IDENTITY")).upper() != "IDENTITY"
+    for key, feature in config.get("features", {}).items():
+        raw = str(modes.get(str(feature.get("type")), "IDENTITY")).upper() == "IDENTITY"
         # The preprocessor normalises observations (and actions in training), the postprocessor actions alone.
-        and (file.name == PREPROCESSOR_FILE or feature.get("type") == "ACTION")
+        unread = processor == POSTPROCESSOR_FILE and feature.get("type") != "ACTION"
         # Datasets have no statistics of the clock, which stays raw, but `lerobot-train` lists it as an input.
-        and key not in CLOCK
-    ]
-    present: set[str] = set()
-    if (name := step.get("state_file")) is not None:
-        state = checkpoint_file(source, file_name(name, f"state_file in {file}"), revision)
-        if state is None:
-            raise MemobenchError(
-                f"the checkpoint {source} lacks its normalisation statistics ({name} is missing); copy the whole "
-                "checkpoint or train it again"
-            )
-        present = set(_shapes(state))
-    missing = [key for key in needed if not any(one.startswith(f"{key}.") for one in present)]
-    if missing:
-        raise MemobenchError(
-            f"the checkpoint {source} has no normalisation statistics for {', '.join(missing)} ({name or file.name}), "
-            "and would act on raw numbers; copy the whole checkpoint or train it again"
-        )
+        if not raw and not unread and key not in CLOCK:
+            yield key
 
 
-# -- code in checkpoints -----------------------------------------------------------------------------------------------
+# --- code in checkpoints ---
 
 
 def check_processors(path: str | Path, revision: str | None = None) -> None:
-    """Refuse processor steps that neither LeRobot nor this package nor an installed plugin registers.
-
-    They are not built.
-
-    Args:
-        path: a checkpoint folder, or a repository, whose processor files are fetched now.
-
-    Raises:
-        MemobenchError: a step is refused.
-    """
-    kind = _type_of(path, revision)
+    """Refuse processor steps that neither LeRobot nor this package nor an installed plugin registers; build none."""
+    config = _file_of(path, CONFIG_FILE, revision)
+    kind = None if config is None else read_json(config).get("type")
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = _file_of(path, name, revision)
-        for reason in (reason for step in steps_of(file) for reason in _reasons(step, kind)):
-            raise MemobenchError(
-                f"{file} {reason}; expected steps with plain settings that LeRobot, this package or an installed "
-                f"{PLUGIN}* package registers: install the policy's package, or use a checkpoint that you trust"
-            )
+        for step in steps_of(file):
+            for reason in _reasons(step, kind):
+                raise MemobenchError(
+                    f"{file} {reason}; expected steps with plain settings that LeRobot, this package or an installed "
+                    f"{PLUGIN}* package registers: install the policy's package, or use a checkpoint that you trust"
+                )
 
 
 def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
@@ -314,9 +276,10 @@ def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
     if not isinstance(name, str) or "class" in step:
         yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
         return
-    found = _registered(name, kind)
-    if found is None or not _trusted(found.__module__.partition(".")[0]):
-        yield f"names the step {name!r}, which {'no package' if found is None else found.__module__} registers"
+    registered = _registered(name, kind)
+    if registered is None or not _trusted(registered.__module__.partition(".")[0]):
+        package = "no package" if registered is None else registered.__module__
+        yield f"names the step {name!r}, which {package} registers"
     yield from (f"holds {key!r} in the settings of the step {name!r}, which would name code" for key in _naming(config))
     if config.get("trust_remote_code") is not False:
         for setting, known in REMOTE_CODE.items():
@@ -325,7 +288,6 @@ def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
 
 
 def _registered(name: str, kind: str | None) -> type | None:
-    """Return the class of a registered step; None if no imported module registers it."""
     from lerobot.policies.factory import get_policy_class
     from lerobot.processor import ProcessorStepRegistry
 
@@ -352,7 +314,7 @@ def _naming(value: Any) -> Iterator[str]:
         yield from _naming(one)
 
 
-# -- weights and settings ----------------------------------------------------------------------------------------------
+# --- weights and settings ---
 
 
 def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
@@ -361,12 +323,6 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
     LeRobot allocates the configured shapes, and continues with random numbers if weights are missing. The weights are
     compared with a policy on the meta device. A policy that cannot be built there (its parts come from the hub) is not
     checked.
-
-    Args:
-        path: a checkpoint folder, or a repository, whose weights are fetched now. policy: its configuration.
-
-    Raises:
-        MemobenchError: weights are missing, or have other shapes.
     """
     if policy.use_peft:
         return
@@ -381,16 +337,12 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
     built = _built_empty(policy)
     if built is None:
         return
-    tensors = _as_loaded(built, _shapes(file))
+    tensors, wanted = _as_loaded(built, _shapes(file)), built.state_dict(keep_vars=True)
     names: dict[int, list[str]] = {}  # a tensor with several names is saved by one of them
-    wanted = {
-        **dict(built.named_parameters(remove_duplicate=False)),
-        **dict(built.named_buffers(remove_duplicate=False)),
-    }
-    for name in built.state_dict():
-        names.setdefault(id(wanted[name]), []).append(name)
+    for name, tensor in wanted.items():
+        names.setdefault(id(tensor), []).append(name)
     missing = [same[0] for same in names.values() if not any(name in tensors for name in same)]
-    wrong = [name for name in built.state_dict() if name in tensors and tensors[name] != tuple(wanted[name].shape)]
+    wrong = [name for name, tensor in wanted.items() if name in tensors and tensors[name] != tuple(tensor.shape)]
     if missing or wrong:
         raise MemobenchError(
             f"the weights of the checkpoint {path} do not fit its policy ({policy.type}): {len(missing)} of "
@@ -403,12 +355,6 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
     """Refuse other settings of a checkpoint than those it was trained with.
 
     The class of its configuration lists them in ``fixed_by_training: ClassVar[tuple[str, ...]]``.
-
-    Args:
-        source: folder or repository. policy: the configuration to act with.
-
-    Raises:
-        MemobenchError: a setting differs.
     """
     fixed = getattr(policy, "fixed_by_training", ())
     for name, asked, held in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
@@ -419,11 +365,7 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
 
 
 def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
-    """Refuse to resume a training with other settings.
-
-    Raises:
-        MemobenchError: a setting differs.
-    """
+    """Refuse to resume a training with other settings."""
     for name, value, held in differing(asked, begun, getattr(begun, "fixed_by_training", ())):
         raise MemobenchError(
             f"this training was begun with {name}={held} and cannot change it; found {value}; "
@@ -433,7 +375,7 @@ def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTr
 
 
 def as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> PreTrainedConfig:
-    """Return the configuration that a checkpoint (folder or repository) was trained with, on a policy's device."""
+    """Return the configuration that a source was trained with, on a policy's device."""
     device = [f"--device={policy.device}"]  # LeRobot logs a warning if the device of the training is not available
     return type(policy).from_pretrained(source, revision=revision, cli_overrides=device)
 
@@ -449,7 +391,6 @@ def differing(
 
 
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every tensor in a file; only its header is read."""
     from safetensors import safe_open
 
     with undamaged(file), safe_open(file, framework="numpy") as tensors:
@@ -462,7 +403,6 @@ def undamaged(file: Path) -> AbstractContextManager[None]:
 
 
 def _built_empty(policy: PreTrainedConfig) -> Any | None:
-    """Return a policy on the meta device; None if it cannot be built there."""
     import torch
     from lerobot.policies.factory import get_policy_class
 
@@ -483,78 +423,56 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     """Return shapes by the names under which the policy loads them: pi0 and its relatives rename tensors."""
     import torch
 
-    renamed = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if renamed is None or type(policy).__module__.startswith(f"{__package__}."):
+    rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if rename is None or type(policy).__module__.startswith(f"{__package__}."):
         return shapes
-    found = renamed({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
-    return {name if name.startswith("model.") else f"model.{name}": tuple(value.shape) for name, value in found.items()}
+    tensors = rename({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
+    return {f"model.{name.removeprefix('model.')}": tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
-def statistics_shapes(path: str | Path, revision: str | None = None) -> dict[str, tuple[int, ...]]:
-    """Return the observations and actions that a policy was trained on with their shapes; {} without statistics.
+def statistics_shapes(source: str | Path) -> dict[str, tuple[int, ...]]:
+    """Return name -> shape of the observations and actions that a policy was trained on; {} without statistics.
 
-    They come from the statistics of its data, because the configuration of a policy that began with another checkpoint
-    may list that checkpoint's features. LeRobot saves them by the names of the data.
+    The configuration of a policy that began with another checkpoint may list that checkpoint's features instead.
     """
-    file = _file_of(path, PREPROCESSOR_FILE, revision)
-    if file is None:
-        return {}
+    file = _file_of(source, PREPROCESSOR_FILE)
     names = [step.get("state_file") for step in filter(_normalises, steps_of(file))]
-    states = [_file_of(path, file_name(name, f"state_file in {file}"), revision) for name in names if name]
-    renamed = trained_names(path, revision)
-    return {
-        renamed.get(name.rpartition(".")[0], name.rpartition(".")[0]): shape
-        for state in states
-        if state is not None
-        for name, shape in _shapes(state).items()
-        if not name.endswith(".count")
-    }
+    states = [_file_of(source, file_name(name, f"state_file in {file}")) for name in names if name]
+    shapes = {key: shape for state in states if state is not None for key, shape in _shapes(state).items()}
+    columns = {key.rpartition(".")[0]: shape for key, shape in shapes.items() if not key.endswith(".count")}
+    renamed = trained_names(source)  # LeRobot saves statistics by the names of the data
+    return {renamed.get(name, name): shape for name, shape in columns.items()}
 
 
-def checkpoint_settings(path: str) -> dict[str, Any]:
-    """Return the settings in the configuration of a checkpoint folder, or of a repository, which is downloaded.
-
-    Raises:
-        MemobenchError: there is none, it cannot be downloaded, or it is no JSON.
-    """
-    if (file := checkpoint_file(path, CONFIG_FILE)) is None:
-        raise MemobenchError(f"the repository {path} holds no {CONFIG_FILE}; expected a checkpoint of LeRobot")
-    return read_json(file)
-
-
-def training_of(path: str | Path, revision: str | None = None) -> dict[str, Any]:
-    """Return the settings of a checkpoint's training (`TrainConfig`); {} if they are not there or not readable."""
+def training_of(source: str | Path) -> dict[str, Any]:
+    """Return the settings of a source's training (`TrainConfig`); {} if they are missing or not readable."""
     with suppress(MemobenchError):
-        if (file := checkpoint_file(path, TRAIN_CONFIG, revision)) is not None:
+        if (file := checkpoint_file(source, TRAIN_CONFIG)) is not None:
             return read_json(file, TrainConfig)
     return {}
 
 
-def trained_names(path: str | Path, revision: str | None = None) -> dict[str, str]:
-    """Return the ``rename_map`` of a checkpoint's training: names in its data -> names of the policy."""
-    if found := training_of(path, revision).get("rename_map"):
-        return dict(found)
-    file = _file_of(path, PREPROCESSOR_FILE, revision)
+def trained_names(source: str | Path) -> dict[str, str]:
+    """Return the ``rename_map`` of a source's training: names in its data -> names of the policy."""
+    if rename_map := training_of(source).get("rename_map"):
+        return dict(rename_map)
+    file = _file_of(source, PREPROCESSOR_FILE)
     configs = [step.get("config", {}) for step in steps_of(file) if step.get("registry_name") == RENAMING]
     return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
-def steps_of(file: Path | None) -> list[Step]:
+def steps_of(file: Path | None) -> list[SavedStep]:
     """Return the steps in the file of a processor; none without a file."""
-    steps: list[Step] = [] if file is None else read_json(file, Processor).get("steps", [])
+    steps: list[SavedStep] = [] if file is None else read_json(file, _Processor).get("steps", [])
     return steps
 
 
-def _normalises(step: Step) -> bool:
+def _normalises(step: SavedStep) -> bool:
     return str(step.get("registry_name", "")).endswith("normalizer_processor")
 
 
 def checkpoint_file(source: str | Path, name: str, revision: str | None = None) -> Path | None:
-    """Return a file of a checkpoint folder, or download it from a repository; None if there is no such file.
-
-    Raises:
-        MemobenchError: the repository cannot be reached.
-    """
+    """Return a file of a source; None if there is no such file. Raise `MemobenchError` if it cannot be downloaded."""
     folder = Path(source).expanduser()
     if folder.is_dir():
         return folder / name if (folder / name).is_file() else None
@@ -572,14 +490,6 @@ def checkpoint_file(source: str | Path, name: str, revision: str | None = None) 
 
 
 def _file_of(path: str | Path, name: str, revision: str | None = None) -> Path | None:
-    """Return `checkpoint_file`; None also if it cannot be downloaded, which LeRobot reports."""
-    try:
+    with suppress(MemobenchError):  # LeRobot reports that it cannot be downloaded
         return checkpoint_file(path, name, revision)
-    except MemobenchError:
-        return None
-
-
-def _type_of(path: str | Path, revision: str | None = None) -> str | None:
-    """Return the type of policy that a checkpoint names."""
-    file = _file_of(path, CONFIG_FILE, revision)
-    return None if file is None else read_json(file).get("type")
+    return None

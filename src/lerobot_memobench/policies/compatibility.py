@@ -1,22 +1,34 @@
-"""Check that a policy's inputs fit an environment's observations."""
+"""Check that a policy's inputs fit an environment: its observations, and the convention of its pictures.
+
+A policy runs on pictures of the convention (`sim.convention`) of its training, or is refused. Each check raises
+`MemobenchError`.
+"""
 
 from __future__ import annotations
 
 import json
+import logging
+import os
 from collections.abc import Collection, Mapping
+from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from lerobot_memobench.datasets.episodes import read_info
+from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import statistics_shapes
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
 from lerobot_memobench.protocol import ENDED, NO_CLOCK
+from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 if TYPE_CHECKING:
     from lerobot.configs import PolicyFeature
     from lerobot.configs.policies import PreTrainedConfig
 
+logger = logging.getLogger(__name__)
 
 SIZE_COUNTS = {
     "act": None,
@@ -33,14 +45,15 @@ SIZE_COUNTS = {
 others resize every picture to a fixed size."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """Prefix of the cameras that LeRobot's ``policy.empty_cameras`` adds; no environment has them."""
+OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
+"""Owners of LIBERO's data on the hub. Other datasets of that name may be of this package."""
 
 
-def cure(missing: str, observed: Collection[str]) -> str:
-    """Return advice on a missing observation, for the end of an error message.
+# --- observations ---
 
-    Args:
-        missing: its name at the policy. observed: the names of the present ones.
-    """
+
+def hint(missing: str, observed: Collection[str]) -> str:
+    """Return advice on an observation that a policy misses among the observed ones, for the end of a message."""
     cameras = ", ".join(key for key in observed if key.startswith(f"{OBS_IMAGES}."))
     if missing == OBS_ENV_STATE:
         return f"set env.obs_type={OBJECTS}, or {BOTH}."
@@ -50,11 +63,7 @@ def cure(missing: str, observed: Collection[str]) -> str:
 
 
 def check_actions(path: str, policy: Any) -> None:
-    """Refuse a policy whose actions are not those of the environment whatever their number.
-
-    Raises:
-        MemobenchError: it is an XVLA of absolute poses.
-    """
+    """Refuse an XVLA of absolute poses, whose actions are not those of the environment whatever their number."""
     if policy.type == "xvla" and policy.action_mode == "ee6d":
         raise MemobenchError(
             f"the policy {path} predicts absolute poses of two hands (action_mode=ee6d, as LIBERO's XVLA), and the "
@@ -72,13 +81,8 @@ def check_features(
     that read pictures of any size, would act on inputs unlike their training data.
 
     Args:
-        path: folder of the checkpoint, or a repository.
-        policy: its configuration.
-        shown: the environment's features by their names at the policy, and its action.
+        shown: features of the environment's observations and action, by LeRobot's names.
         renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
-
-    Raises:
-        MemobenchError: an input differs.
     """
     check_actions(path, policy)
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
@@ -86,14 +90,14 @@ def check_features(
     trained = statistics_shapes(path)
     there = {renamed.get(name, name): feature for name, feature in shown.items()}
     original = {renamed.get(name, name): name for name in shown}
-    _check_cameras(path, cameras_read(policy, trained), there, original)
+    _check_cameras(path, cameras_read(policy, trained), original)
     features = {
         OBS_STATE: policy.robot_state_feature,
         OBS_ENV_STATE: policy.env_state_feature if OBS_ENV_STATE in there else None,  # else see `check_obs_type`
         ACTION: policy.action_feature,
     }
     for name, feature in features.items():
-        length = _length(policy, name, feature, trained)
+        length = None if feature is None else _length(policy, name, feature, trained)
         if name == OBS_STATE and length is not None and name not in there:
             raise MemobenchError(
                 f"the policy {path} reads {name} ({length} numbers), and the environment has {_list(original)}; map "
@@ -122,35 +126,31 @@ def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     return [name for name in cameras if name in trained] or named[: max(1, len(named) - filled)]
 
 
-def _check_cameras(
-    path: str, cameras: list[str], there: Mapping[str, PolicyFeature], original: Mapping[str, str]
-) -> None:
-    missing = [name for name in cameras if name not in there]
+def _check_cameras(path: str, cameras: list[str], original: Mapping[str, str]) -> None:
+    missing = [name for name in cameras if name not in original]
     if not missing:
         return
-    free = [original[name] for name in there if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
-    found = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
+    free = [known for name, known in original.items() if name.startswith(f"{OBS_IMAGES}.") and name not in cameras]
+    inputs = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
     if len(free) < len(missing):
         raise MemobenchError(
-            f"{found}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
+            f"{inputs}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
             "this environment"
         )
     mapped = {name: known for known, name in original.items() if known in cameras and known != name}
     guess = json.dumps(mapped | dict(zip(free, missing, strict=False)))
-    raise MemobenchError(f"{found}; map its names, for example by --rename_map='{guess}'")
+    raise MemobenchError(f"{inputs}; map its names, for example by --rename_map='{guess}'")
 
 
 def _list(original: Mapping[str, str]) -> str:
     return ", ".join(name for name in original.values() if name != ACTION)
 
 
-def _length(policy: Any, name: str, feature: PolicyFeature | None, trained: Mapping[str, Any]) -> int | None:
-    """Return the length of a state or an action in a policy's training data; None if it is unknown.
+def _length(policy: Any, name: str, feature: PolicyFeature, trained: Mapping[str, Any]) -> int | None:
+    """Return the length of a vector in a policy's training data; None if it is unknown.
 
-    A policy that pads them may list the padded length, or that of the checkpoint that its training began with.
+    A policy that pads vectors may list the padded length, or that of the checkpoint that its training began with.
     """
-    if feature is None:
-        return None
     padded = getattr(policy, "max_state_dim" if name == OBS_STATE else "max_action_dim", None)
     if name in trained and len(trained[name]) == 1:
         return int(trained[name][0])
@@ -164,13 +164,11 @@ def keeps_sizes(policy: PreTrainedConfig) -> bool:
 
 
 def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
-    if not keeps_sizes(policy):
-        return
-    resizes = SIZE_COUNTS[policy.type]
-    for name, feature in policy.image_features.items():
+    for name, feature in policy.image_features.items() if keeps_sizes(policy) else ():
         if name in there and tuple(there[name].shape) != tuple(feature.shape):
             here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
             height, width = feature.shape[1:]
+            resizes = SIZE_COUNTS[policy.type]
             also = "" if resizes is None else f", or with --policy.{resizes} for both"
             raise MemobenchError(
                 f"the policy {path} was trained on {name} of {seen} pixels and does not resize it, and the environment "
@@ -178,6 +176,73 @@ def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, Policy
                 f"pictures of that size{also}"
             )
 
+
+# --- the convention of pictures ---
+
+
+def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
+    """Return the convention of a checkpoint (folder or repository), None if it is unclear, and what shows it.
+
+    The names of the cameras in its training data decide, then the dataset on this machine, then its repository. They
+    do not depend on the ``rename_map`` of an evaluation.
+    """
+    in_data = {new: old for old, new in trained_names(path).items()}
+    cameras = [in_data.get(name, name) for name in cameras_read(policy, statistics_shapes(path))]
+    has = {convention: f"{OBS_IMAGES}.{wrist}" in cameras for convention, wrist in WRIST.items()}
+    given = training_of(path).get("dataset") or {}
+    root, name = given.get("root") or "", given.get("repo_id") or ""
+    why = f"cameras {', '.join(cameras)}; dataset {name or 'unknown'}"
+    if has[MIRRORED]:
+        return MIRRORED, why
+    if root and os.path.isfile(os.path.join(root, INFO_FILE)):  # pathlib raises at names that are too long
+        with suppress(MemobenchError):
+            if (stated := convention_of(read_info(Path(root))["features"])) is not None:
+                return stated, why
+    if "libero" in name.lower():
+        return (None if has[UPRIGHT] and not name.startswith(OF_LIBERO) else MIRRORED), why
+    return (UPRIGHT if has[UPRIGHT] else None), why
+
+
+def chosen_convention(
+    path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
+) -> str | None:
+    """Return the convention of the pictures for a policy: ``asked``, else that of its training.
+
+    None if the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused; so is none
+    where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
+    mirror pictures.
+    """
+    if asked is not None:
+        check_choice("convention", asked, [*WRIST])
+    own: str | None = UPRIGHT
+    if getattr(policy, "uses_detector", False):
+        why = "its detector reads them"
+    elif path is None or not policy.image_features:
+        return asked
+    else:
+        own, why = trained_convention(path, policy)
+    name = path or policy.type
+    command = f"lerobot eval env=memobench policy={name} convention="
+    if own is None and asked is None:
+        raise MemobenchError(
+            f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
+            f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
+        )
+    mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
+    for other in (asked, *mapped):
+        if own is not None and other not in (None, own):
+            where = "" if other == asked else " in rename_map, which does not mirror pictures"
+            raise MemobenchError(
+                f"the policy {name} expects pictures of convention={own} ({why}), and found {other}{where}; run "
+                f"`{command}{own}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
+                f"--env.convention={own}`"
+            )
+    if asked is None and own != UPRIGHT:
+        logger.warning("pictures have convention=%s, as in the training of %s (%s)", own, name, why)
+    return asked or own
+
+
+# --- the clock of observations ---
 
 Clock = tuple[int, int]
 """Phase and step of an observation (`lerobot_memobench.protocol`)."""

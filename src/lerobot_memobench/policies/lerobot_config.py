@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import hashlib
 import json
 import logging
-import secrets
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import Acting
+from lerobot_memobench.envs.evaluation_file import Acting
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
@@ -27,7 +25,7 @@ NOT_THE_CHECKPOINT = (
 
 ELSEWHERE = (
     *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
-    *("host", "port", "servers", "connect_timeout", "timeout", "retry"),
+    *("host", "port", "servers", "connect_timeout", "timeout"),
 )
 """Settings of where a policy runs or is published; its actions do not depend on them."""
 
@@ -51,9 +49,9 @@ def encoded(policy: Any) -> dict[str, Any]:
     """Return a policy's configuration as plain JSON values."""
     import draccus
 
-    found = json.loads(json.dumps(draccus.encode(policy), default=str))
-    assert isinstance(found, dict)
-    return {**found, "type": policy.type}
+    values = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(values, dict)
+    return {**values, "type": policy.type}
 
 
 def check_sizes(policy: Any) -> None:
@@ -79,19 +77,15 @@ def has_device(device: str) -> bool:
     from lerobot.utils.device_utils import is_torch_device_available
 
     try:
-        found = torch.device(device)
-        there = is_torch_device_available(found.type)
+        asked = torch.device(device)
+        available = is_torch_device_available(asked.type)
     except (RuntimeError, ValueError):  # there is no such type
         return False
-    return there and (found.type != "cuda" or (found.index or 0) < torch.cuda.device_count())
+    return available and (asked.type != "cuda" or (asked.index or 0) < torch.cuda.device_count())
 
 
 def check_device(device: str | None) -> None:
-    """Refuse a device that the user names and the machine lacks. LeRobot would run on another one.
-
-    Raises:
-        MemobenchError: the machine has no such device.
-    """
+    """Refuse a device that the user names and the machine lacks. LeRobot would run on another one."""
     if device is not None and device not in ("", "null", "~") and not has_device(device):
         raise MemobenchError(
             f"this machine has no device {device!r} that torch can use; leave the device out to use the best one, or "
@@ -102,32 +96,34 @@ def check_device(device: str | None) -> None:
 # --- identity ---
 
 
-def acting(policy: Any, path: str | None, seeds: range | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the episode log.
+def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
+    """Return the description of a policy for the evaluation's file.
 
     Args:
         policy: its configuration.
         path: its checkpoint; None for a policy without one.
-        seeds: seeds of the requested episodes, see `Acting`.
         settings: settings of its environments.
     """
-    run = f"{dt.datetime.now():%Y%m%dT%H%M%S}-{secrets.token_hex(3)}"
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
-    return Acting(_identity(policy, path), inputs, run, seeds)
-
-
-def _identity(policy: Any, path: str | None) -> dict[str, Any]:
-    """Return a policy's type and one hash over its checkpoint and the settings that differ from it."""
     weights = None if path is None else checkpoint_hash(path)
+    hashed = {"sha256": weights} if path is not None and Path(path).is_dir() else {}
+    return Acting({"type": policy.type, "identity": identity_of(policy, path, weights), **hashed}, inputs)
+
+
+def identity_of(policy: Any, path: str | None, weights: str | None) -> str:
+    """Return a policy's type and one hash over its checkpoint's hash and the settings that differ from it."""
     with quiet():
-        default = _default_config(policy, path)
-    facts = json.dumps([policy.type, weights, _changes(policy, default)], sort_keys=True, default=str)
-    found = {"type": policy.type, "identity": f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"}
-    return found | ({"sha256": weights} if path is not None and Path(path).is_dir() else {})
+        before = encoded(_default_config(policy, path))
+    changes = {
+        key: file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
+        for key, value in encoded(policy).items()
+        if key not in (*ELSEWHERE, "type") and before.get(key) != value
+    }
+    facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)
+    return f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"
 
 
 def _default_config(policy: Any, path: str | None) -> Any:
-    """Return the configuration of a checkpoint, or the default one of a type."""
     from lerobot.configs import PreTrainedConfig
 
     if path is not None:
@@ -136,16 +132,6 @@ def _default_config(policy: Any, path: str | None) -> Any:
         return type(policy)()
     except TypeError:  # a plugin with a required setting
         return policy
-
-
-def _changes(policy: Any, default: Any) -> dict[str, Any]:
-    """Return the settings that differ from the default; a file is represented by its hash."""
-    before, now = encoded(default), encoded(policy)
-    return {k: _content(v) for k, v in now.items() if k not in (*ELSEWHERE, "type") and before.get(k) != v}
-
-
-def _content(value: Any) -> Any:
-    return file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
 
 
 def checkpoint_hash(path: str) -> str:

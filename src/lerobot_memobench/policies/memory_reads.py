@@ -10,14 +10,13 @@ import gzip
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.observations import RESET
+from lerobot_memobench.envs.settings import RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file
 from lerobot_memobench.tasks.task import PUBLISHED
@@ -25,6 +24,7 @@ from lerobot_memobench.tasks.task import PUBLISHED
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from lerobot_memobench.envs.settings import EnvSettings
     from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
 
 MEMORY_READS = "memory_reads"
@@ -32,13 +32,11 @@ MEMORY_READS = "memory_reads"
 
 
 class Chunk(TypedDict):
-    """The reads of one action chunk.
+    """The reads of one action chunk. Steps are control steps, counted from the policy's first observation.
 
     Attributes:
-        step: control step of the plan, counted from the policy's first observation; this is the execution's first if
-            the prompt plays in ``reset``.
-        entries: control steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as
-            slots.
+        step: of the plan.
+        entries: steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as slots.
         weights: share of attention on each entry; the sum is one if only memory is attended to.
     """
 
@@ -48,15 +46,10 @@ class Chunk(TypedDict):
 
 
 class EpisodeReads(TypedDict):
-    """The content of a file.
-
-    Attributes:
-        seed: the seed of episode 0 plus the episode's number. The log has the scene's seed, shared by its variants.
-        referent: of the episode, as in the log.
-        chunks: in the order of their plans.
-    """
+    """The content of a file, with chunks in the order of their plans."""
 
     seed: Whole
+    """The seed of episode 0 plus the episode's number. The log has the scene's seed, shared by its variants."""
     referent: Name
     chunks: list[Chunk]
 
@@ -67,9 +60,8 @@ class EpisodeReads(TypedDict):
 def chunk_reads(steps: list[int], memory: MemoryTokens, layers: list[Tensor]) -> list[Chunk]:
     """Return the reads of the chunks of B rows that are planned at these control steps.
 
-    Args:
-        layers: attention on each token in each layer and pass, (B, L) each. They are averaged, and summed over the
-            tokens of an entry, or over its shares of tokens (`MemoryTokens.sources`).
+    Attention on each token, (B, L) for each layer and pass, is averaged over them, and summed over the tokens of an
+    entry, or over its shares of tokens (`MemoryTokens.sources`).
     """
     import torch
     from einops import einsum
@@ -82,19 +74,19 @@ def chunk_reads(steps: list[int], memory: MemoryTokens, layers: list[Tensor]) ->
         entries = (-1 - torch.arange(real.shape[1], device=real.device)).expand_as(real)
         if memory.steps is not None:
             entries = torch.where(memory.steps < 0, entries, memory.steps)
-    found: list[Chunk] = []
-    for step, of, each, there in zip(steps, entries, weights, real, strict=True):
-        named, place = of[there].float().round().long().unique(return_inverse=True)
-        shares = torch.zeros(len(named), device=each.device).index_add(0, place, each[there].float())
-        found.append({"step": step, "entries": named.tolist(), "weights": shares.tolist()})
-    return found
+    chunks: list[Chunk] = []
+    for step, entry, weight, is_real in zip(steps, entries, weights, real, strict=True):
+        unique, index = entry[is_real].float().round().long().unique(return_inverse=True)
+        shares = torch.zeros(len(unique), device=weight.device).index_add(0, index, weight[is_real].float())
+        chunks.append({"step": step, "entries": unique.tolist(), "weights": shares.tolist()})
+    return chunks
 
 
 # --- files ---
 
 
 def reads_file(folder: Path, task: str, episode: int) -> Path:
-    """Return the place of an episode's file; ``folder`` is the log's."""
+    """Return the path of an episode's file in the folder of its log."""
     return folder / MEMORY_READS / f"{file_name(task, 'the name of a task')}.{episode}.json.gz"
 
 
@@ -106,45 +98,35 @@ def write_reads(path: Path, reads: EpisodeReads) -> None:
     write_file(path, gzip.compress(text.encode(), mtime=0))
 
 
-@dataclass(frozen=True)
-class ReadLog:
-    """Writes the reads of an evaluation's episodes.
+@contextmanager
+def noting_reads(
+    folder: Path, settings: EnvSettings, task: str, policy: Any, seeds: Sequence[int]
+) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
+    """Watch a batch of rollouts; the yielded function writes the reads of finished episodes, a mask (rows,).
 
-    Attributes:
-        folder: of the episode log. seed_base: seed of episode 0. referent: of every episode.
+    Episodes that were already in the log are not planned and keep their files.
+
+    Args:
+        folder: of the episode log. settings: of the environments. seeds: of the rows.
     """
+    policy.watch_memory()
+    written = np.zeros(len(seeds), bool)
 
-    folder: Path
-    seed_base: int
-    referent: str
+    def ended(over: NDArray[np.bool_]) -> None:
+        if (over == written).all():
+            return
+        rows = policy.memory_reads()
+        for row in np.flatnonzero(over & ~written):
+            written[row] = True
+            if row < len(rows) and rows[row]:
+                reads: EpisodeReads = {"seed": seeds[row], "referent": settings.referent, "chunks": rows[row]}
+                write_reads(reads_file(folder, task, seeds[row] - settings.seed_base), reads)
 
-    @contextmanager
-    def noting(self, task: str, policy: Any, seeds: Sequence[int]) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
-        """Watch a batch of rollouts; the yielded function writes the reads of finished episodes, a mask (rows,).
-
-        Episodes that were already in the log are not planned and keep their files.
-
-        Raises:
-            MemobenchError: the policy cannot report its reads.
-        """
-        policy.watch_memory()
-        written = np.zeros(len(seeds), bool)
-
-        def ended(over: NDArray[np.bool_]) -> None:
-            if (over == written).all():
-                return
-            rows = policy.memory_reads()
-            for row in np.flatnonzero(over & ~written):
-                written[row] = True
-                if row < len(rows) and rows[row]:
-                    reads: EpisodeReads = {"seed": seeds[row], "referent": self.referent, "chunks": rows[row]}
-                    write_reads(reads_file(self.folder, task, seeds[row] - self.seed_base), reads)
-
-        try:
-            yield ended
-            ended(np.ones(len(seeds), bool))
-        finally:
-            policy.watch_memory(False)
+    try:
+        yield ended
+        ended(np.ones(len(seeds), bool))
+    finally:
+        policy.watch_memory(False)
 
 
 def find_reads(
@@ -156,7 +138,7 @@ def find_reads(
     rollouts with pauses have no chunks.
     """
     unseen = protocol.get("prompt_in") == RESET
-    found: dict[int, list[Chunk]] = {}
+    chunks_of: dict[int, list[Chunk]] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
         try:
@@ -169,30 +151,30 @@ def find_reads(
             continue
         # The clock of a strict task counts its prompt, even if the policy did not see it.
         shift = int(record.get("prompt_steps") or 0) if unseen and record.get("suite", PUBLISHED) == PUBLISHED else 0
-        chunks = [_later(chunk, shift) for chunk in reads["chunks"]]
-        if not _is_of(reads, record) or not _fit(chunks, record):
+        chunks: list[Chunk] = [
+            {
+                "step": chunk["step"] + shift,
+                "entries": [entry + shift if entry >= 0 else entry for entry in chunk["entries"]],
+                "weights": chunk["weights"],
+            }
+            for chunk in reads["chunks"]
+        ]
+        if not _fit(reads, chunks, record):
             misfits.append(f"{path} is not of the rollout in the log")
         elif not record.get("paused_steps"):
-            found[k] = chunks
+            chunks_of[k] = chunks
     if not misfits:
-        return found, []
-    return found, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
+        return chunks_of, []
+    return chunks_of, [f"{count_of(len(misfits), 'file')} of {MEMORY_READS} left out, the first because {misfits[0]}"]
 
 
-def _later(chunk: Chunk, shift: int) -> Chunk:
-    entries = [entry + shift if entry >= 0 else entry for entry in chunk["entries"]]
-    return {"step": chunk["step"] + shift, "entries": entries, "weights": chunk["weights"]}
-
-
-def _is_of(reads: EpisodeReads, record: Mapping[str, Any]) -> bool:
+def _fit(reads: EpisodeReads, chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:
+    """Return whether reads are of a rollout, and all chunks lie within it, with one weight per entry and none ahead."""
     if record.get("seed") is None or reads["referent"] != record.get("referent", "fixed"):
         return False
     scene = int(record["episode"]) // int(record.get("variants") or 1)
-    return reads["seed"] - int(record["episode"]) == int(record["seed"]) - scene
-
-
-def _fit(chunks: Sequence[Chunk], record: Mapping[str, Any]) -> bool:
-    """Return whether all chunks lie within the rollout, with one weight per entry and no future entries."""
+    if reads["seed"] - int(record["episode"]) != int(record["seed"]) - scene:
+        return False
     paused, steps = int(record.get("paused_steps") or 0), record.get("steps")
     end = None if steps is None else int(record.get("prompt_steps") or 0) + int(steps) + paused
     return all(

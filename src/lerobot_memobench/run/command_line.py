@@ -26,7 +26,6 @@ from lerobot_memobench.errors import MemobenchError, chain, nearest
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
     check_checkpoint,
-    check_registered,
     checkpoint_folder,
     checkpoint_settings,
     checkpoint_type,
@@ -348,8 +347,12 @@ def chosen_class(kind: Any, name: str, section: Mapping[str, Any]) -> type | Non
     if (path := section.get(PATH)) is not None:
         if not isinstance(path, str):
             raise MemobenchError(f"found {name}.{PATH}={str(path)[:80]}; expected a name")
-        chosen = checkpoint_type(path) or checkpoint_settings(path).get(TYPE)
-        check_registered(path)
+        chosen = checkpoint_type(path)
+        if chosen not in known:
+            raise MemobenchError(
+                f"the checkpoint {path} is of policy type {chosen!r}, which no installed package registers; install "
+                "the package that trained it"
+            )
     if chosen is None:
         return None
     if not isinstance(chosen, str):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.device_utils import get_safe_torch_device
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_memobench.envs.configuration_memobench import Opener
 from lerobot_memobench.envs.episode_log import has_log
+from lerobot_memobench.envs.evaluation_file import INPUTS, POLICY, Acting, read_evaluation
+from lerobot_memobench.envs.lerobot import Opener
 from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.policies.lerobot_config import acting, quiet
-from lerobot_memobench.policies.memory_reads import ReadLog
+from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.memory_reads import noting_reads
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, PlannedTask
 from lerobot_memobench.run.rollout import Actor, BatchSeeds, roll
 
@@ -32,7 +34,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
 
     Args:
         cells: the batches, those of one task in succession.
-        begin: called once, after the policy is loaded and before the first scene.
+        begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
 
     Raises:
         MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
@@ -49,13 +51,14 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     rests = plan.environment.corrupt != SWAP
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
     asked = range(plan.seed, plan.seed + plan.grid.runs)
-    by = acting(policy, plan.policy_path, asked, environment.settings)
+    facts = read_evaluation(plan.log)
+    by = Acting(facts[POLICY], facts["protocol"][INPUTS], asked)
     # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
     opened = environment.opener(actor.policy.config, by, plan.log)
     environments = Environments(opened, plan.settings.use_async_envs is not False)
     seeds = BatchSeeds(actor.policy, plan.seed)
     scenes = environment.settings
-    reads = ReadLog(plan.log, scenes.seed_base, scenes.referent) if plan.options.memory_reads else None
+    reads = partial(noting_reads, plan.log, scenes) if plan.options.memory_reads else None
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
     done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
     with amp, closing(environments):
@@ -64,7 +67,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
             batch = range(plan.seed + runs.start, plan.seed + runs.stop)
             env = environments.of(task, len(batch))
             seeds.begin(task.name, batch.start)
-            with nullcontext() if reads is None else reads.noting(task.name, actor.policy, batch) as ended:
+            with nullcontext() if reads is None else reads(task.name, actor.policy, batch) as ended:
                 roll(env, actor, batch, ended, scenes.corrupt)
             done += len(batch)
             advance(done, total, task.name)

@@ -14,7 +14,7 @@ from lerobot_memobench.errors import MemobenchError
 if TYPE_CHECKING:
     from lerobot.configs import PreTrainedConfig
 
-    from lerobot_memobench.envs.episode_log import Acting
+    from lerobot_memobench.envs.evaluation_file import Acting
 
 PREFIX = "lerobot-"
 
@@ -68,10 +68,9 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
         MemobenchError: as of `chosen_convention` and `check_obs_type`; or LeRobot's command would run the policy in
             LIBERO's pipelines.
     """
-    from lerobot_memobench.envs.episode_log import UNKNOWN_POLICY
+    from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY
     from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
-    from lerobot_memobench.policies.compatibility import check_actions
-    from lerobot_memobench.policies.convention import chosen_convention
+    from lerobot_memobench.policies.compatibility import check_actions, chosen_convention
     from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.run.command_line import PATH, parse_words, read_words
     from lerobot_memobench.sim.convention import MIRRORED
@@ -87,7 +86,7 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
         return policy, UNKNOWN_POLICY
     check_obs_type(policy, environment.obs_type, environment.suite)
     if path is None:
-        return policy, acting(policy, None, None, environment.settings)
+        return policy, acting(policy, None, environment.settings)
     check_actions(path, policy)
     if policy.type == "xvla":
         raise MemobenchError(
@@ -100,4 +99,4 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     if found not in (None, environment.convention):  # with the names of its pictures
         names = {"features": policy_features(), "features_map": policy_names()}
         vars(environment).update(vars(replace(environment, **names, convention=found)))
-    return policy, acting(policy, path, None, environment.settings)
+    return policy, acting(policy, path, environment.settings)

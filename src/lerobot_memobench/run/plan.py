@@ -15,14 +15,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
+from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
 from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
-from lerobot_memobench.policies.compatibility import check_features
-from lerobot_memobench.policies.convention import chosen_convention
+from lerobot_memobench.policies.compatibility import check_features, chosen_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.protocol import (
     EVALUATION_EPISODES,
@@ -41,7 +40,7 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
-    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.run.settings import EvaluationSettings
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
@@ -154,9 +153,9 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     Raises:
         MemobenchError: it cannot be run.
     """
-    from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
+    from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.run.settings import policy_of, with_policy
-    from lerobot_memobench.sim.libero.files import check_assets
+    from lerobot_memobench.sim.files import check_assets
 
     if options.resume and asked.output_dir is None:
         raise MemobenchError("resume=true needs the folder of the evaluation to resume: output_dir=<folder>")
@@ -376,8 +375,8 @@ def with_salt(asked: EvaluationSettings, options: RunOptions, log: Path) -> Eval
         return asked
     if options.resume:
         for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
-            if protocol := protocol_of(folder):
-                return asked.env_default(salt=protocol.get("salt"))
+            if has_evaluation(folder):
+                return asked.env_default(salt=read_evaluation(folder)["protocol"].get("salt"))
     if options.shard is not None:
         raise MemobenchError(
             f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
@@ -417,9 +416,8 @@ def with_batch_size(
 
 def earlier_batch_size(log: Path) -> int | None:
     """Return the batch size of the evaluation in a folder, None where it is not known."""
-    starts = read_evaluation(log).get("runs") or [{}]
-    size = starts[-1].get("batch_size")
-    return None if size is None else int(size)
+    starts = read_evaluation(log).get("runs") if has_evaluation(log) else None
+    return int(starts[-1]["batch_size"]) if starts else None
 
 
 # --- how it is run: resume=, shard=, shards=, workers= … ---

@@ -12,55 +12,42 @@ import dataclasses
 import datetime as dt
 import re
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
-from annotated_types import Ge, Le
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_memobench.envs.episode_log import MOST_EPISODES, OMITTED, differences, read_log
-from lerobot_memobench.envs.evaluation_file import protocol_of, read_evaluation
+from lerobot_memobench.envs.episode_log import key_of, read_log
+from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings, revision
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import SCENES, disagreements
-from lerobot_memobench.evaluation.records import other_hashes
+from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
 from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.protocol import HORIZON, SEALED
-from lerobot_memobench.run.card import PACKAGES, detector_hash, drawn_with, first_variant_mismatch, versions
+from lerobot_memobench.run.card import PACKAGES, detector_hash, versions
 from lerobot_memobench.run.command_line import (
     NULLS,
     PLAIN,
     chosen_class,
     field_types,
     load_plugins,
-    nested,
     value_of,
     without_none,
 )
 from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, typed_settings
-from lerobot_memobench.sim.convention import UPRIGHT
-from lerobot_memobench.sim.scene_hash import WORLD, check_world
-from lerobot_memobench.tasks.difficulty import STANDARD
-from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
+from lerobot_memobench.tasks.task import PUBLISHED, STANDARD
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
 MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
-NAMED = {"success", "steps", "checkpoints"}
-"""Fields that a card must name of an episode: a repetition compares them."""
-OF_EARLIER_VERSIONS = re.compile(
-    r"--(eval\.recording.*|job_name=.*|env\.render_every=1|env\.world=\w+|env\.max_parallel_tasks=1)"
-)
-"""Flags on cards of earlier versions on which no outcome depends."""
-
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
 """Settings of a policy that change more than numbers. All other numbers and truth values are accepted."""
 SERVERS = ("host", "servers")
@@ -68,18 +55,6 @@ WORD = re.compile(r"[\w.,+' ()-]*")
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
-
-
-class CardSettings(TypedDict, total=False):
-    """The settings of an evaluation on a card, see `EvaluationSettings`."""
-
-    env: dict[str, Any]
-    policy: dict[str, str | bool | float | list[Any] | None]
-    seed: int | None
-    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)] | None
-    batch_size: Annotated[int, Ge(0), Le(512)] | None
-    use_async_envs: bool | None
-    rename_map: dict[str, str]
 
 
 def repeat(
@@ -106,36 +81,34 @@ def repeat(
     check_policy(card)
     for note in differences_here(card):
         say(f"note: {note}")
-    plan = plan_of_card(card, out)
-    check_extent(card, plan)
+    plan, episodes = plan_of_card(card, out), read_log(path if path.is_dir() else path.parent)
+    check_extent(card, episodes, plan)
     if status := evaluate(plan):
         return status
-    here = protocol_of(plan.log)
+    here = read_evaluation(plan.log)["protocol"]
     for note in (hashed := other_hashes(card["protocol"], here)):
         say(f"note: {note}")
     problems = differences(card["protocol"], here)
-    problems += disagreements(card["episodes"], read_log(plan.log), "here", [SCENES] if hashed else [])
+    problems += disagreements(episodes, read_log(plan.log), "there", "here", [SCENES] if hashed else [])
     if not problems:
-        say(f"repeated: {count_of(len(card['episodes']), 'episode')}, as on the card")
+        say(f"repeated: {count_of(len(episodes), 'episode')}, as in the log")
         return 0
     say(f"not repeated: {problems[0]}")
     return 1
 
 
 def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
-    """Return the card of a finished evaluation, with ``asked``, its settings, checked by `allowed_settings`.
+    """Return the card of an evaluation, with ``asked``, its settings, checked by `allowed_settings`.
 
     Args:
         path: the card's file or its folder.
         server: address of the policy's server (``host:port``, or several with commas); the card's when None.
 
     Raises:
-        MemobenchError: there is no card, it holds no episodes, or a setting is refused.
+        MemobenchError: there is no card, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
-    if not card["episodes"]:
-        raise MemobenchError(f"{path} holds no episodes to compare with; expected the card of a finished evaluation")
-    return {**card, "asked": allowed_settings(settings_on(card), server)}
+    return {**card, "asked": allowed_settings(settings_of(card), server)}
 
 
 def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> EvaluationPlan:
@@ -143,18 +116,17 @@ def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> Evaluation
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])
     options = RunOptions(split=SEALED if card["asked"].env.get("salt") else None, shard=shard)
-    asked = card["asked"].env_default(convention=UPRIGHT)  # earlier cards do not name it
-    return make_plan(replace(asked, output_dir=str(out)), options, ("memobench", "rerun"))
+    return make_plan(replace(card["asked"], output_dir=str(out)), options, ("memobench", "rerun"))
 
 
 # --- whether this machine and version can repeat it ---
 
 
-def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
+def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]], plan: EvaluationPlan) -> None:
     """Refuse a card whose settings run other episodes than it names, or whose episodes may take too long.
 
     Raises:
-        MemobenchError: success, steps or checkpoints of an episode of its protocol are not on the card, an episode of
+        MemobenchError: success, steps or checkpoints of an episode of its protocol are not in the log, an episode of
             another protocol is, or an episode may take more than `MOST_STEPS`.
     """
     asked, grid = card["protocol"], plan.grid
@@ -171,30 +143,29 @@ def check_extent(card: Mapping[str, Any], plan: EvaluationPlan) -> None:
             "command yourself if you trust it"
         )
     wanted = {episode for cell in grid.cells(plan.options.shard) for episode in grid.episodes(cell)}
-    named = {(e["task"], e["episode"]) for e in card["episodes"] if "not_run" in e or {*e} >= NAMED}
+    named = {key_of(each) for each in episodes if "not_run" in each or "steps" in each}
     for task, episode in sorted(wanted ^ named)[:1]:
-        problem = "lacks success, steps or checkpoints of" if (task, episode) in wanted else "does not ask for"
+        problem = "log lacks" if (task, episode) in wanted else "card does not ask for"
         raise MemobenchError(
-            f"the card {problem} {task}, episode {episode}; expected the outcome of each of the "
-            f"{count_of(len(wanted), 'episode')} of its protocol, as on the card of a finished evaluation"
+            f"the {problem} {task}, episode {episode}; expected the outcome of each of the "
+            f"{count_of(len(wanted), 'episode')} of the card's protocol, as of a finished evaluation"
         )
 
 
 def check_version(card: Mapping[str, Any]) -> None:
-    """Refuse a card of an earlier version whose scenes this version draws or runs differently.
+    """Refuse a card of a version with other goals or holds of strict tasks.
 
     Raises:
         MemobenchError: it names that version.
     """
     run, protocol = card["runs"][-1], card["protocol"]
-    check_world(protocol.get(WORLD), "the card")
     version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
-    problem = first_variant_mismatch(card["episodes"])
     for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
-        if (there := protocol.get(name, OMITTED[name])) != here:
-            problem = problem or f"{name}={there} on the card, {name}={here} here"
-    if problem is not None:
-        raise MemobenchError(f"an earlier version ran the card ({problem}); repeat it with that version ({version})")
+        if (there := protocol.get(name)) != here:
+            raise MemobenchError(
+                f"another version ran the card ({name}={there} on the card, {name}={here} here); repeat it with that "
+                f"version ({version})"
+            )
 
 
 def check_policy(card: Mapping[str, Any]) -> None:
@@ -225,12 +196,12 @@ def check_policy(card: Mapping[str, Any]) -> None:
 
 def differences_here(card: Mapping[str, Any]) -> list[str]:
     """Return the differences between this machine and those of a card's runs."""
-    here = drawn_with({"versions": versions()})
+    here = versions()
     notes = []
     for run in card["runs"]:
         changed = [
             f"{name} {version} (here {here[name]})"
-            for name, version in drawn_with(run).items()
+            for name, version in run["versions"].items()
             if here.get(name, version) != version
         ]
         if changed:
@@ -239,27 +210,6 @@ def differences_here(card: Mapping[str, Any]) -> list[str]:
 
 
 # --- settings that a card may hold ---
-
-
-def settings_on(card: Mapping[str, Any]) -> EvaluationSettings:
-    """Return the settings of a card, also of an earlier card with LeRobot's flags; their values are not checked yet.
-
-    Raises:
-        MemobenchError: they have another form.
-    """
-    if "settings" in card:
-        found = card["settings"]
-        for name, value in found.items():
-            if name not in CardSettings.__annotations__:
-                raise _refused(name, value, "no card sets it")
-        return EvaluationSettings(**found)
-    flags = (flag for flag in card.get("flags", ()) if not OF_EARLIER_VERSIONS.fullmatch(flag))
-    values = dict(flag.removeprefix("--").partition("=")[::2] for flag in flags)
-    if (kind := values.get("env.type")) != "memobench":
-        raise MemobenchError(f"found env.type={kind} on the card; expected an evaluation of the benchmark")
-    if "env.task" in values:
-        values["env.tasks"] = values.pop("env.task")
-    return typed_settings(nested(values))
 
 
 def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
@@ -271,13 +221,6 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
     Raises:
         MemobenchError: a card may not hold one of them.
     """
-    try:
-        checked(vars(asked), CardSettings)
-    except Malformed as error:
-        raise MemobenchError(f"the card's settings: {error}; run its command yourself if you trust it") from None
-    asked = replace(asked, env={name: value for name, value in asked.env.items() if name != WORLD})
-    if asked.output_dir is not None:
-        raise _refused("output_dir", asked.output_dir, "no card sets it")
     if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):
         raise _refused("rename_map", asked.rename_map, "expected names of observations")
     for name, value in asked.env.items():

@@ -7,25 +7,22 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import POLICY, differences, has_log, read_log
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
-from lerobot_memobench.envs.settings import SCENE_HASHES
+from lerobot_memobench.envs.episode_log import Key, has_log, key_of, read_lines
+from lerobot_memobench.envs.evaluation_file import (
+    EVALUATION_FILE,
+    POLICY,
+    differences_of_parts,
+    read_evaluation,
+    write_evaluation,
+)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, read_protocol, requested_lines
+from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import count_of, refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import (
-    card_of,
-    drawn_with,
-    extended,
-    first_variant_mismatch,
-    with_checkpoint,
-    with_episodes,
-    write_card,
-)
+from lerobot_memobench.run.card import card_of, extended, with_checkpoint
 from lerobot_memobench.run.evaluate import Advance, evaluate
 from lerobot_memobench.run.plan import Cell, EvaluationPlan, Shard
 
@@ -64,7 +61,10 @@ def run_evaluation(
         if cells:
             begin(_summary(plan))
             return _run(plan, card, cells, note, advance)
-        return _finish(plan, card) if has_log(plan.log) else None
+        if not has_log(plan.log):
+            return None
+        write_evaluation(plan.log, card)
+        return write_report(plan.log)
 
 
 def _summary(plan: EvaluationPlan) -> str:
@@ -78,28 +78,19 @@ def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note
     ended = False
 
     def begin() -> None:
-        nonlocal card
-        card = with_checkpoint(card, plan.policy_path)
-        write_card(plan.log, card)
+        write_evaluation(plan.log, with_checkpoint(card, plan))
 
-    write_card(plan.log, card)
+    write_evaluation(plan.log, card)
     try:
         evaluate(plan, cells, begin, advance)
         ended = True
-        return _finish(plan, card)
+        return write_report(plan.log)
     finally:
         if not ended and has_log(plan.log):
             note(
                 f"the episodes that ended are in {plan.log}; report them: `memobench report {plan.log}`; "
                 f"resume: `{plan.resuming_command}`"
             )
-
-
-def _finish(plan: EvaluationPlan, card: dict[str, Any]) -> Run:
-    """Write the report of the log, and the outcomes onto the card."""
-    records = requested_lines(plan.log, read_log(plan.log))
-    write_card(plan.log, with_episodes(with_checkpoint(card, plan.policy_path), records))
-    return write_report(plan.log)
 
 
 # --- resuming: whether it is the same evaluation, and which episodes are left ---
@@ -116,20 +107,15 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
     check_folder(folder)
     if not has_log(folder):
         return card
-    unknown = () if read_evaluation(folder) else (SCENE_HASHES,)  # a log alone
-    found = differences(read_protocol(folder), {**card["protocol"], POLICY: card[POLICY]}, policy=True, ignore=unknown)
-    if found:
+    earlier = read_evaluation(folder)
+    if found := differences_of_parts(earlier, card):
         raise MemobenchError(
             f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
             "settings to resume it, or choose another output_dir="
         )
-    if (problem := first_variant_mismatch(read_log(folder))) is not None:
-        raise MemobenchError(
-            f"an earlier version ran the episodes in {folder} and drew other variants ({problem}); resume with that "
-            "version, or choose another output_dir="
-        )
-    if POLICY not in read_evaluation(folder):
-        note(f"note: {folder} has no result card: whether its episodes are of this policy cannot be checked")
+    if "runs" not in earlier:  # LeRobot's own command wrote it
+        if not earlier[POLICY]:
+            note(f"note: {folder} names no policy: whether its episodes are of this policy cannot be checked")
         return card
     earlier = read_evaluation(folder, whole=True)
     edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
@@ -144,7 +130,7 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
     """Return the differences of two starts on which numbers may depend: the batch size, and the first version."""
     sizes = {"batch_size": earlier["batch_size"]}, {"batch_size": now["batch_size"]}
     found = []
-    for there, here in (sizes, (drawn_with(earlier), drawn_with(now))):
+    for there, here in (sizes, (earlier["versions"], now["versions"])):
         changed = [f"{key} {there[key]}, now {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
         found += changed[:1]
     return found
@@ -153,16 +139,13 @@ def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list
 def missing(plan: EvaluationPlan) -> list[Cell]:
     """Return the batches that are to be run; a batch with a missing episode is run whole, its logged rows rest."""
     options = plan.options
-    done = logged(plan.log, plan.environment.referent) if options.resume or options.shard is not None else set()
+    done = logged(plan.log) if options.resume or options.shard is not None else set()
     return plan.grid.missing(done, options.shard)
 
 
-def logged(folder: Path, referent: str) -> set[tuple[str, int]]:
-    """Return (task, episode) of the episodes in a folder's log, with those that could not be run."""
-    if not has_log(folder):
-        return set()
-    records = read_log(folder)
-    return {(record["task"], record["episode"]) for record in records if record.get("referent", "fixed") == referent}
+def logged(folder: Path) -> set[Key]:
+    """Return the episodes in a folder's log, with those that could not be run."""
+    return {*map(key_of, read_lines(folder))} if has_log(folder) else set()
 
 
 # --- the folder of an evaluation ---

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -12,8 +11,8 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.envs.configuration_memobench import MemobenchEnvConfig
-from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
+from lerobot_memobench.envs.settings import SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import portable_path
 from lerobot_memobench.run.command_line import (
@@ -80,17 +79,27 @@ class EvaluationSettings:
 
     @property
     def portable(self) -> dict[str, Any]:
-        """The settings as JSON for the card.
+        """The settings for the card, as far as its protocol does not hold them; `settings_of` reads them back.
 
         They leave out the folders that are written. The package's own policies go by name, other paths are absolute.
         """
-        found = {key: value for key, value in dataclasses.asdict(self).items() if key != "output_dir"}
-        found["env"] = {key: value for key, value in found["env"].items() if key not in ("log_dir", "resume")}
-        for section, name in (("policy", "path"), ("env", "task_dir")):
-            if (named := found[section].get(name)) is not None and Path(named).expanduser().exists():
-                portable = portable_path(named) if section == "policy" else named
-                found[section][name] = str(Path(named).expanduser().absolute()) if portable == named else portable
-        return found
+        left_out = (*SETTINGS, "log_dir", "resume")
+        env = {name: value for name, value in self.env.items() if name not in left_out}
+        policy = dict(self.policy)
+        for section, name in ((policy, "path"), (env, "task_dir")):
+            if (named := section.get(name)) is not None and Path(named).expanduser().exists():
+                portable = portable_path(named) if section is policy else named
+                section[name] = str(Path(named).expanduser().absolute()) if portable == named else portable
+        loop = {name: getattr(self, name) for name in ("batch_size", "use_async_envs")}
+        return {"env": env, "policy": policy, **loop, "rename_map": dict(self.rename_map)}
+
+
+def settings_of(card: Mapping[str, Any]) -> EvaluationSettings:
+    """Return the settings of a card, see `EvaluationSettings.portable`; their values are not checked."""
+    protocol, stored = card["protocol"], card["settings"]
+    env = {name: protocol[name] for name in SETTINGS if name in protocol} | stored.get("env", {})
+    own = {"env": env, "seed": card["policy"].get("seed"), "episodes": protocol["episodes"]}
+    return EvaluationSettings(**stored | own)
 
 
 def read_settings(words: Mapping[str, str]) -> EvaluationSettings:

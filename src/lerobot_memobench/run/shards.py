@@ -17,18 +17,23 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import EXTENT, POLICY, differences, has_log, key_of, read_log, write_episodes
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, protocol_of, read_evaluation, write_protocol
+from lerobot_memobench.envs.episode_log import Key, has_log, key_of, read_log, write_episodes
+from lerobot_memobench.envs.evaluation_file import (
+    EXTENT,
+    POLICY,
+    differences_of_parts,
+    read_evaluation,
+    write_evaluation,
+)
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.agreement import check_lines, disagreement, extent_of
-from lerobot_memobench.evaluation.records import Run, read_protocol
+from lerobot_memobench.evaluation.records import Run, disagreement
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, refuse_links
 from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import card_of, extended, first_variant_mismatch, with_episodes, write_card
+from lerobot_memobench.run.card import card_of, extended
 from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
 from lerobot_memobench.run.run import (
     VIDEOS,
@@ -63,8 +68,7 @@ class ShardJob:
     words: tuple[str, ...]
     shard: Shard
     out: Path
-    episodes: frozenset[tuple[str, int]]
-    referent: str
+    episodes: frozenset[Key]
     directory: Path
     at_once: int
 
@@ -95,7 +99,7 @@ class ShardJob:
 
     def finished(self) -> bool:
         """Whether all episodes of the part are in its log."""
-        return self.episodes <= logged(self.folder, self.referent)
+        return self.episodes <= logged(self.folder)
 
     def failure(self) -> str | None:
         """Return None: a part that cannot be run raises."""
@@ -154,7 +158,6 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
-            referent=plan.environment.referent,
             directory=Path.cwd(),
             at_once=min(options.workers or options.shards, options.shards),
         )
@@ -200,7 +203,7 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
 def _merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
     merge(out, folders)
     run = write_report(out)
-    if _names_policy(read_protocol(out), read_log(out)):
+    if run.protocol[POLICY]:
         return run
     note = f"{out} does not name the policy of its episodes: no part did"
     return replace(run, notes=[*run.notes, note])
@@ -214,80 +217,22 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
 
     Raises:
         MemobenchError: there are no parts, protocols or policies differ, a line contradicts them, a part does not name
-            its policy where another does, variants were drawn by two rules, or an episode ended differently in two
-            parts.
+            its policy where another does, or an episode ended differently in two parts.
     """
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
-    records = {source: read_log(source) for source in sources}
-    protocols = {source: read_protocol(source) for source in sources}
-    for source, lines in records.items():
-        check_lines(source, read_evaluation(source), lines)
-    _check_protocols(protocols)
-    _check_policies(protocols, records)
-    _check_draws(records)
-    joined = join(records)
-    card = _joined_card(sources)
-    stored = [*map(protocol_of, sources)]
+    logs = {source: read_log(source) for source in sources}
+    card = _joined_card({source: read_evaluation(source) for source in sources})
+    records = join(logs)
 
     refuse_links(out / VIDEOS, out / MEMORY_READS)
-    out.mkdir(parents=True, exist_ok=True)
     for source in folders:
         if source != out:
             _share(source / VIDEOS, out / VIDEOS, "*.mp4")
             _share(source / MEMORY_READS, out / MEMORY_READS, "*.json.gz")
-    write_episodes(out, joined)
-    (out / EVALUATION_FILE).unlink(missing_ok=True)
-    if card is not None:
-        extent = extent_of(card, joined)
-        write_card(out, with_episodes(card, [each for each in joined if extent is None or extent.includes(each)]))
-    elif all(stored):  # the first protocol that has a setting counts
-        settings = functools.reduce(lambda first, other: {**other, **first}, [*stored, *protocols.values()])
-        write_protocol(out, {key: value for key, value in settings.items() if key not in EXTENT})
-
-
-def _check_protocols(protocols: Mapping[Path, Mapping[str, Any]]) -> None:
-    (first, reference), *others = protocols.items()
-    for folder, protocol in others:
-        found = differences(reference, protocol, policy=True)
-        if found:
-            raise MemobenchError(
-                f"{first} and {folder} were run under different protocols ({'; '.join(found)}); merge parts of one "
-                "evaluation"
-            )
-
-
-def _names_policy(protocol: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether a folder names the policy of its episodes, in its protocol or card, or in every line."""
-    return bool(protocol[POLICY]) or all(record.get(POLICY) for record in records)
-
-
-def _check_policies(
-    protocols: Mapping[Path, Mapping[str, Any]], records: Mapping[Path, Sequence[Mapping[str, Any]]]
-) -> None:
-    """Refuse to merge episodes of an unknown policy with those of a known policy: all would get its name."""
-    named = {record[POLICY]: folder for folder, lines in records.items() for record in lines if record.get(POLICY)}
-    if len(named) > 1:
-        (a, mine), (b, other), *_ = named.items()
-        raise MemobenchError(f"{mine} holds episodes of {a} and {other} of {b}; merge parts of one evaluation")
-    unnamed = [folder for folder in protocols if not _names_policy(protocols[folder], records[folder])]
-    if unnamed and (named or len(unnamed) < len(protocols)):
-        raise MemobenchError(
-            f"{unnamed[0]} does not name the policy of its episodes, and another part does; evaluate the policy again "
-            "there, or leave that folder out"
-        )
-
-
-def _check_draws(records: Mapping[Path, Sequence[Mapping[str, Any]]]) -> None:
-    """Refuse to merge variants drawn by an earlier version with those of this version."""
-    problems = {folder: first_variant_mismatch(lines) for folder, lines in records.items()}
-    earlier = [folder for folder, problem in problems.items() if problem is not None]
-    if 0 < len(earlier) < len(records):
-        raise MemobenchError(
-            f"an earlier version ran the episodes in {earlier[0]} and drew other variants ({problems[earlier[0]]}); "
-            "leave that folder out"
-        )
+    write_episodes(out, records)
+    write_evaluation(out, card)
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
@@ -296,7 +241,7 @@ def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, An
     Raises:
         MemobenchError: two parts disagree about an episode.
     """
-    found: dict[tuple[str, int, str], tuple[Path, Mapping[str, Any]]] = {}
+    found: dict[Key, tuple[Path, Mapping[str, Any]]] = {}
     for folder, records in parts.items():
         for record in records:
             known = found.setdefault(key_of(record), (folder, record))
@@ -306,14 +251,27 @@ def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, An
     return [dict(found[key][1]) for key in sorted(found)]
 
 
-def _joined_card(folders: Sequence[Path]) -> dict[str, Any] | None:
-    """Return one card for all folders, None where one of them has none."""
-    if not all(POLICY in read_evaluation(folder) for folder in folders):
-        return None
-    cards = {folder: read_evaluation(folder, whole=True) for folder in folders}
-    joined = functools.reduce(partial(extended, again=False), cards.values())
-    for folder, card in cards.items():
-        for name, value in card["task_files"].items():
+def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
+    """Return one card for all folders; where LeRobot's own commands ran one of them, protocol and policy alone."""
+    (first, card), *others = cards.items()
+    for folder, other in others:
+        if found := differences_of_parts(card, other):
+            raise MemobenchError(
+                f"{first} and {folder} were run under different protocols ({'; '.join(found)}); merge parts of one "
+                "evaluation"
+            )
+        if bool(card[POLICY]) != bool(other[POLICY]):  # else all episodes would get its name
+            raise MemobenchError(
+                f"{folder if card[POLICY] else first} does not name the policy of its episodes, and another part does; "
+                "evaluate the policy again there, or leave that folder out"
+            )
+    if not all("runs" in each for each in cards.values()):
+        protocol = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
+        return {"format": card["format"], "protocol": protocol, POLICY: card[POLICY]}
+    whole = {folder: read_evaluation(folder, whole=True) for folder in cards}
+    joined = functools.reduce(partial(extended, again=False), whole.values())
+    for folder, each in whole.items():
+        for name, value in each["task_files"].items():
             if joined["task_files"][name] != value:
                 raise MemobenchError(
                     f"the episodes of {name} in {folder} were run with other task files than the others"

@@ -1,4 +1,4 @@
-"""How does a task move and look? The scene, the arm, pictures; predicates answered by physics."""
+"""Simulate and render a task, and evaluate its predicates: scenes from files, the arm, states, object observations."""
 
 from lerobot_memobench.io import choose_caches
 

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.asset import COLLISION_GROUP, Articulation, split_class
-from lerobot_memobench.sim.libero.mjcf import known_classes
+from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import FIELDS, SLOTS, STARTS, WIDTH
+from lerobot_memobench.sim.placement import quaternion_matrix
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from mujoco_raster.highlights import Highlight
 
@@ -59,21 +60,18 @@ _NORMALS_ARGUMENT = (None,) if "normal:" in str(mujoco.mj_multiRay.__doc__) else
 
 @dataclass(frozen=True)
 class Thing:
-    """An object, a fixture, or a moving part of a fixture.
-
-    Attributes:
-        kind: index of its class.
-        body: id of the body that defines its pose.
-        joint: address of its joint in qpos, None without one.
-        site: id of the site that defines its position, None for the body's.
-        ordered_by: id of the body whose position sorts it.
-    """
+    """An object, a fixture, or a moving part of a fixture."""
 
     kind: int
+    """Index of its class."""
     body: int
+    """Id of the body that defines its pose."""
     joint: int | None
+    """Address of its joint in qpos, None without one."""
     site: int | None
+    """Id of the site that defines its position, None for the body's."""
     ordered_by: int
+    """Id of the body whose position sorts it."""
 
 
 class ObjectSlots:
@@ -92,13 +90,13 @@ class ObjectSlots:
         self._owner = np.full(sim.model.nbody, -1)
         for name, asset in sim.assets.items():
             root = sim.model.body(name).id
-            self._add(Thing(class_index(split_class(asset.class_name)[0]), root, None, None, root))
+            self._add(Thing(_class_index(split_class(asset.class_name)[0]), root, None, None, root))
             for part in asset.articulations.values():
                 joint = sim.model.joint(part.joint)
                 body = int(sim.model.jnt_bodyid[joint.id])
                 site = sim.model.site(part.handle_site).id if part.shares_origin else None
                 ordered_by = root if part.shares_origin else body
-                self._add(Thing(class_index(part.kind), body, int(joint.qposadr[0]), site, ordered_by))
+                self._add(Thing(_class_index(part.kind), body, int(joint.qposadr[0]), site, ordered_by))
         if len(self.things) > SLOTS:
             raise MemobenchError(
                 f"task {sim.task.name} has {len(self.things)} objects and moving parts, more than the {SLOTS} slots of "
@@ -124,7 +122,7 @@ class ObjectSlots:
         shown = zip(self.things, self._visible(), strict=True)
         things = [thing for thing, visible in shown if visible and thing.body not in absent]
         rows = np.array([self._row(thing) for thing in things]).reshape(-1, WIDTH)
-        return fill_slots(rows, round_to_resolution(self._sim.data.xpos[[thing.ordered_by for thing in things]]))
+        return fill_slots(rows, _rounded(self._sim.data.xpos[[thing.ordered_by for thing in things]]))
 
     def position(self, thing: Thing) -> Array:
         """Return the position (3,) of a thing in the world, m: of its origin, or of its handle if it has a site."""
@@ -138,21 +136,20 @@ class ObjectSlots:
     def _surface(self, index: int, body: int) -> Array:
         """Return `POINTS_PER_THING` distant points slightly inside a thing's opaque geoms, in its body's frame."""
         model = self._sim.model
-        found = []
+        surfaces = []
         for geom in np.flatnonzero((self._owner[model.geom_bodyid] == index) & (model.geom_group == COLLISION_GROUP)):
-            points = corners(model, geom)
-            points = points @ rotation(model.geom_quat[geom]).T + model.geom_pos[geom]
+            points = _geom_points(model, geom)
+            points = points @ quaternion_matrix(model.geom_quat[geom]).T + model.geom_pos[geom]
             inner = model.geom_bodyid[geom]
             while inner != body:
-                points = points @ rotation(model.body_quat[inner]).T + model.body_pos[inner]
+                points = points @ quaternion_matrix(model.body_quat[inner]).T + model.body_pos[inner]
                 inner = model.body_parentid[inner]
-            found.append(points)
-        points = farthest_points(np.concatenate(found), POINTS_PER_THING)
+            surfaces.append(points)
+        points = _farthest(np.concatenate(surfaces), POINTS_PER_THING)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         return middle + 0.94 * (points - middle)
 
     def _visible(self) -> NDArray[np.bool_]:
-        """Return for each thing whether it is visible to a camera."""
         model, data = self._sim.model, self._sim.data
         frames = data.xmat[self._bodies].reshape(-1, 3, 3)
         targets = np.einsum("nij,nj->ni", frames, self._points) + data.xpos[self._bodies]
@@ -161,7 +158,7 @@ class ObjectSlots:
             tried = self._point_indices[hits < MIN_VISIBLE_POINTS, batch].ravel()
             origin = data.cam_xpos[camera].copy()
             rays = targets[tried] - origin
-            inside = in_picture(rays @ data.cam_xmat[camera].reshape(3, 3), float(model.cam_fovy[camera]))
+            inside = _in_image(rays @ data.cam_xmat[camera].reshape(3, 3), float(model.cam_fovy[camera]))
             count = int(inside.sum())
             if not count:
                 continue
@@ -178,10 +175,10 @@ class ObjectSlots:
     def _row(self, thing: Thing) -> Array:
         data = self._sim.data
         position = self.position(thing)
-        turned = data.xmat[thing.body].reshape(3, 3)
+        rotation = data.xmat[thing.body].reshape(3, 3)
         joint = 0.0 if thing.joint is None else data.qpos[thing.joint]
         lit = float(is_lit(position, self._sim.highlights))
-        pose = round_to_resolution(np.array([*position, *turned[:, 0], *turned[:, 1], joint]))
+        pose = _rounded(np.array([*position, *rotation[:, 0], *rotation[:, 1], joint]))
         return np.array([1.0, thing.kind, *pose, lit]) + 0.0  # no negative zeros
 
 
@@ -190,12 +187,7 @@ def is_lit(position: Array, highlights: Iterable[Highlight]) -> bool:
     return any(np.hypot(*(position[:2] - np.array(mark.position[:2]))) < mark.radius for mark in highlights)
 
 
-def class_index(kind: str) -> int:
-    """Return the index of a class.
-
-    Raises:
-        MemobenchError: the class is unknown.
-    """
+def _class_index(kind: str) -> int:
     if kind not in classes():
         raise MemobenchError(
             f"class {kind!r} is not available in object observations; use env.obs_type=pixels_agent_pos"
@@ -203,8 +195,7 @@ def class_index(kind: str) -> int:
     return classes().index(kind)
 
 
-def round_to_resolution(values: Array) -> Array:
-    """Return values as multiples of `POSE_RESOLUTION`."""
+def _rounded(values: Array) -> Array:
     return np.round(values / POSE_RESOLUTION) * POSE_RESOLUTION
 
 
@@ -220,14 +211,7 @@ def fill_slots(things: Array, places: Array | None = None) -> NDArray[np.float32
     return slots.reshape(-1)
 
 
-def rotation(quaternion: Array) -> Array:
-    """Return the rotation matrix (3, 3) of a quaternion wxyz."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, quaternion)
-    return matrix.reshape(3, 3)
-
-
-def corners(model: mujoco.MjModel, geom: int) -> Array:
+def _geom_points(model: mujoco.MjModel, geom: int) -> Array:
     """Return points (n, 3) on a geom's surface in its frame: a mesh's vertices, else its bounding box's corners."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
@@ -238,7 +222,7 @@ def corners(model: mujoco.MjModel, geom: int) -> Array:
     return np.asarray(middle + signs * half)
 
 
-def farthest_points(points: Array, count: int) -> Array:
+def _farthest(points: Array, count: int) -> Array:
     """Return ``count`` of the points (n, 3), each the farthest from its predecessors; repeat if there are fewer."""
     chosen = [int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
@@ -248,7 +232,7 @@ def farthest_points(points: Array, count: int) -> Array:
     return points[chosen]
 
 
-def in_picture(rays: Array, fovy: float) -> NDArray[np.bool_]:
+def _in_image(rays: Array, fovy: float) -> NDArray[np.bool_]:
     """Return a mask (n,) of the rays (n, 3) in a camera's frame (looking along -z) that hit its square image."""
     edge = -rays[:, 2] * np.tan(np.radians(fovy) / 2)
     return (np.abs(rays[:, 0]) < edge) & (np.abs(rays[:, 1]) < edge)

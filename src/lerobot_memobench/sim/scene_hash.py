@@ -1,21 +1,14 @@
-"""Source and hash of a scene, by which evaluations of the same scenes are recognised."""
+"""Source of scenes, and version of their hash, by which evaluations of the same scenes are recognised."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
 from lerobot_memobench.errors import MemobenchError
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 WORLD, LIBERO, FORMER = "world", "libero", "memobench"
 """Field of logs, datasets and evaluation files that names the source of the scenes; its value; and its value, which
 files may omit, for the scenes that version 0.2 modelled in code."""
 SCENE_HASH_VERSION = 2
-"""Raise it with each change of a scene's hash: of this function, of states, or of rounding in the simulation.
+"""Raise it with each change of a scene's hash: of `Simulation.scene_hash`, of states, or of rounding in the simulation.
 
 1: release 0.2.0.
 """
@@ -37,11 +30,3 @@ def check_world(found: str | None, what: str, error: type[MemobenchError] = Memo
             f"{what} is of the scenes that version 0.2 modelled in code; this version has LIBERO's scenes only, use "
             "version 0.2 for it"
         )
-
-
-def scene_hash(state: NDArray, fixture_poses: Mapping[str, NDArray]) -> str:
-    """Return a short hash of a state and the fixtures' poses, see `Simulation`."""
-    digest = hashlib.sha256(state.tobytes())
-    for name, pose in sorted(fixture_poses.items()):
-        digest.update(name.encode() + pose.tobytes())
-    return digest.hexdigest()[:16]

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import hashlib
 import reprlib
-from collections.abc import Callable, Sequence
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
@@ -15,19 +20,17 @@ from scipy.spatial.transform import Rotation
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
-from lerobot_memobench.sim.controller import CLOSING_SIGNS, make_controller
-from lerobot_memobench.sim.hiding import HiddenObject, HiddenObjects
-from lerobot_memobench.sim.libero.placement import Placer
-from lerobot_memobench.sim.libero.scene import GLOW_OFF, GLOW_ON, get_scene
-from lerobot_memobench.sim.libero.settling import settling_step
-from lerobot_memobench.sim.rendering import RenderSettings, get_rasterizer, get_renderer, translate_errors
-from lerobot_memobench.sim.scene import AGENTVIEW, SUBSTEPS
-from lerobot_memobench.sim.scene_hash import scene_hash
-from lerobot_memobench.sim.world import StartState, World
+from lerobot_memobench.sim.placement import Placer
+from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
+from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
-from mujoco_raster.drawlist import DrawList, Image
+from mujoco_raster.drawlist import Image
+from mujoco_raster.errors import RasterError
 from mujoco_raster.highlights import Highlight
+
+if TYPE_CHECKING:
+    from mujoco_raster.rasterizer import Rasterizer
 
 Array = NDArray[np.float64]
 
@@ -39,6 +42,12 @@ MAX_SCENES = 200
 """Maximum number of draws of a strict scene."""
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """No motion, gripper open."""
+
+DEFAULT, HIGH = "default", "high"
+QUALITIES = (DEFAULT, HIGH)
+"""``high`` is for figures and videos: a pixel is the mean of four, at four times the cost."""
+CACHED_RASTERIZERS = 4
+"""Rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB."""
 
 
 class InvalidActionError(MemobenchError):
@@ -71,6 +80,44 @@ def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
 
 
 @dataclass(frozen=True)
+class RenderSettings:
+    """Size and quality of frames; see `QUALITIES`."""
+
+    height: int = 256
+    width: int = 256
+    quality: str = DEFAULT
+
+    def __post_init__(self) -> None:
+        if self.quality not in QUALITIES:
+            raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
+        if self.height < 1 or self.width < 1:
+            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; use sizes of 1 or more")
+
+
+class _RasterizerCache(threading.local):
+    """Rasterizers of a thread, by scene and size; one serves one thread at a time."""
+
+    def __init__(self) -> None:
+        self.rasterizers: OrderedDict[tuple[object, ...], Rasterizer] = OrderedDict()
+
+
+_cache = _RasterizerCache()
+
+
+def get_rasterizer(scene: Scene, height: int, width: int) -> Rasterizer:
+    """Return this thread's rasterizer of a scene, created on first use and shared by simulations of the scene."""
+    from mujoco_raster.rasterizer import Rasterizer  # loads numba
+
+    key, cached = (scene.key, height, width), _cache.rasterizers
+    if key not in cached:
+        while len(cached) >= CACHED_RASTERIZERS:
+            cached.popitem(last=False)
+        cached[key] = Rasterizer(*scene.drawing(), width, height)
+    cached.move_to_end(key)
+    return cached[key]
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """Complete state of a simulation; see `Simulation.snapshot`."""
 
@@ -85,18 +132,10 @@ class Snapshot:
 
 
 class Simulation:
-    """Simulate the scene of one task at 20 Hz.
+    """Simulate the scene of one task at 20 Hz; the task's goal is not used.
 
     After `reset` and each `step`, positions, contacts and velocity-dependent terms in `data` match the present state.
     All queries are functions of `state()` and the fixtures' poses.
-
-    Args:
-        task: task that defines the scene; its goal is not used.
-        render: size and quality of frames.
-
-    Attributes:
-        settled: whether objects rest where they were placed, and nothing moves, after `reset`; False in some published
-            scenes, whose placements are LIBERO's.
     """
 
     def __init__(self, task: Task, render: RenderSettings | None = None) -> None:
@@ -106,7 +145,7 @@ class Simulation:
         self._scene = scene
         self._strict = task.suite == STRICT
         self.model: mujoco.MjModel = copy.copy(scene.model)
-        # Disable robosuite's unused force and torque sensors, which cost time in each physics step.
+        # robosuite's force and torque sensors are unused, but cost time in each physics step.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR.value
         self.data = mujoco.MjData(self.model)
         self.assets = scene.assets
@@ -115,16 +154,17 @@ class Simulation:
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
-        self.caught_at_home, self.settled = False, True
+        self.caught_at_home = False
+        """Whether the detent at home caught the hand in the last step."""
+        self.settled = True
+        """Whether objects rested where they were placed after `reset`. Some of LIBERO's placements do not."""
         self._begun: Snapshot | None = None
         self.highlights: tuple[Highlight, ...] = ()
-        self._drawn: tuple[mujoco.MjModel, mujoco.MjData, DrawList] | None = None
-        self._controller = make_controller(self.model)
+        self._drawn: tuple[mujoco.MjModel, mujoco.MjData] | None = None
+        self._controller = robot.Controller(self.model)
         self._placer = Placer(task, self.model, self.data, scene.assets)
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
-        self._arm_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.ARM_JOINTS]
-        self._finger_qpos = [int(self.model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
         self._glowing = [(asset, geom) for asset in scene.assets.values() for geom in asset.glow]
 
@@ -155,7 +195,7 @@ class Simulation:
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
         for draw in range(MAX_SCENES):
-            self.settled = self._has_settled(self._set_up(seed, draw, settling, state))
+            self.settled = self._set_up(seed, draw, settling, state)
             if self.settled or not self._strict:
                 break
         else:
@@ -169,36 +209,31 @@ class Simulation:
 
     def _set_up(
         self, seed: int, draw: int, settling: Callable[[Callable[[Atom], bool]], None] | None, state: Array | None
-    ) -> dict[str, Array]:
-        """Set one draw of the initial state, run the stabilisation steps, and return objects' places before them."""
+    ) -> bool:
+        """Return whether objects rest where they were placed, and nothing moves."""
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[self._arm_qpos] = robot.ARM_START
-        self.data.qpos[self._finger_qpos] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
+        self.data.qpos[robot.ARM] = robot.ARM_START
+        self.data.qpos[robot.FINGERS] = robot.GRIPPER_OPEN if self._strict else robot.GRIPPER_START
         self._placer.place(seed, draw)
         self.highlights = ()
         mujoco.mj_step1(self.model, self.data)
         self._controller.reset(self.data)
         if self._strict:
-            self._controller.gripper = np.array([1.0, -1.0])
+            self._controller.gripper = -robot.CLOSING_SIGNS  # the command of open fingers
         if state is not None:
             self.set_state(state)
-        places = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
+        drawn_positions = {name: self.data.body(name).xpos.copy() for name in self.task.objects}
         for step in range(STABILISATION_STEPS):
             if state is None:
                 self.step(NO_OP)
             else:
-                settling_step(self._controller, self.model, self.data, first=step == 0)
+                self._controller.settle(self.data, first=step == 0)
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
-        return places
-
-    def _has_settled(self, places: dict[str, Array]) -> bool:
-        """Return whether objects rest where they were placed, and nothing moves."""
-        others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
-        shifts = [self.data.body(name).xpos[:2] - place[:2] for name, place in places.items()]
+        shifts = [self.data.body(name).xpos[:2] - position[:2] for name, position in drawn_positions.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
-        return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[others:]).max(initial=0.0)) <= SETTLED_SPEED
+        return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED
 
     def begin_execution(self) -> None:
         """Store the present state as the reference of the atoms in `SINCE_START`."""
@@ -219,7 +254,7 @@ class Simulation:
         time = self.data.time
         self._start.mark_step()
         self._controller.set_goal(self.data, action)
-        self._controller.advance(self.data, float(action[6]), SUBSTEPS)
+        self._controller.advance(self.data, float(action[6]))
         self._check_physics(time)
         if self._hidden.absent:
             self._update_hidden()
@@ -233,7 +268,6 @@ class Simulation:
                 self._put_back(self._at_home, arm_only=True)
 
     def _update_hidden(self) -> None:
-        """Keep absent objects parked; put those whose drawer is ajar into it."""
         ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
         revealed = self._hidden.reveal(ajar)
         self._hidden.park()
@@ -260,8 +294,8 @@ class Simulation:
         self.restore(start)
         if arm_only:
             self._hidden.absent = absent
-            others = max(self._finger_qpos) + 1  # arm and fingers come first in the model
-            self.data.qpos[others:], self.data.qvel[others:] = qpos[others:], qvel[others:]
+            others = robot.OTHERS
+            self.data.qpos[others], self.data.qvel[others] = qpos[others], qvel[others]
             mujoco.mj_step1(self.model, self.data)
         else:
             self._start.mark_objects(self.absent)
@@ -271,7 +305,7 @@ class Simulation:
 
     @property
     def state_dim(self) -> int:
-        """Length of `state()`: 1 + nq + nv of the compiled model."""
+        """Length of `state()`."""
         return int(1 + self.model.nq + self.model.nv)
 
     @property
@@ -324,10 +358,8 @@ class Simulation:
         physics = np.empty(self.physics_dim)
         mujoco.mj_getState(self.model, self.data, physics, self._full)
         controller = self._controller
-        position, rotation = controller.goal_position.copy(), controller.goal_rotation.copy()
-        return Snapshot(
-            physics, position, rotation, controller.gripper.copy(), self._start.goes_on, self._hidden.absent
-        )
+        goal = controller.goal_position.copy(), controller.goal_rotation.copy(), controller.gripper.copy()
+        return Snapshot(physics, *goal, self._start.goes_on, self._hidden.absent)
 
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
         """Restore a snapshot of this simulation, bit for bit.
@@ -348,7 +380,7 @@ class Simulation:
         """Restore the state before a demonstration prompt, without the hidden objects.
 
         Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
-        objects are absent until their drawers are ajar (`sim.hiding`).
+        objects are absent until their drawers are ajar (`HiddenObjects`).
 
         Args:
             start: state before the prompt.
@@ -363,47 +395,58 @@ class Simulation:
 
     def scene_hash(self) -> str:
         """Return a short hash of the present state and the fixtures' poses."""
-        return scene_hash(self.state(), self.fixture_poses())
+        digest = hashlib.sha256(self.state().tobytes())
+        for name, pose in sorted(self.fixture_poses().items()):
+            digest.update(name.encode() + pose.tobytes())
+        return digest.hexdigest()[:16]
 
     # --- observation ----------------------------------------------------------------------------------------
 
     def render(self, camera: str = "agentview") -> Image:
         """Return the image of a camera (`agentview` or `wrist`), (height, width, 3) uint8, upright."""
-        model, data, draw_list = self._drawing()
-        for asset, geom in self._glowing:
-            lit = self.holds(Atom("turnon", (asset.name,)))
-            model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
-        renderer = get_renderer(self._scene.key, model, self.render_settings, draw_list)
-        with translate_errors():
-            return renderer.draw(model, data, _mjcf_camera(camera), self.highlights)
+        from mujoco_raster.rasterizer import mean_of_four  # loads numba
+
+        fine = self.render_settings.quality == HIGH
+        with self._rasterizer(2 if fine else 1) as (rasterizer, model, data):
+            for asset, geom in self._glowing:
+                lit = self.holds(Atom("turnon", (asset.name,)))
+                model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
+            image = rasterizer.draw(model, data, _mjcf_camera(camera), self.highlights)
+        return mean_of_four(image) if fine else image
 
     def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
-        model, data, draw_list = self._drawing()
-        rasterizer = get_rasterizer(self._scene.key, model, self.render_settings, draw_list)
-        with translate_errors():
+        with self._rasterizer() as (rasterizer, model, data):
             geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
         return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
-    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData, DrawList]:
-        """Return the scene's visual model in the present pose, its data, and its draw list."""
+    @contextlib.contextmanager
+    def _rasterizer(self, scale: int = 1) -> Iterator[tuple[Rasterizer, mujoco.MjModel, mujoco.MjData]]:
+        """Return a rasterizer, with the visual model and its data in the present pose."""
+        size = self.render_settings
+        model, data = self._drawing()
+        try:
+            yield get_rasterizer(self._scene, scale * size.height, scale * size.width), model, data
+        except RasterError as error:
+            raise MemobenchError(str(error)) from error
+
+    def _drawing(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
         if self._drawn is None:
-            drawing, listed = self._scene.drawing()
-            drawing = copy.copy(drawing)
-            self._drawn = drawing, mujoco.MjData(drawing), listed
-        model, data, draw_list = self._drawn
+            model = copy.copy(self._scene.drawing()[0])
+            self._drawn = model, mujoco.MjData(model)
+        model, data = self._drawn
         for name, pose in self.fixture_poses().items():
             body = model.body(name).id
             model.body_pos[body], model.body_quat[body] = pose[:3], pose[3:]
         data.qpos[:] = self.data.qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)
-        return model, data, draw_list
+        return model, data
 
     def proprio(self) -> NDArray[np.float32]:
         """Return the 8-D proprioception: end-effector position (3), axis-angle (3), finger positions (2)."""
         position, rotation_vector = self.data.site_xpos[self._grip], axis_angle(self.data.xquat[self._hand])
-        return np.concatenate([position, rotation_vector, self.data.qpos[self._finger_qpos]]).astype(np.float32)
+        return np.concatenate([position, rotation_vector, self.data.qpos[robot.FINGERS]]).astype(np.float32)
 
     def robot_state(self) -> dict[str, dict[str, Array]]:
         """Return hand, fingers and joints as in LeRobot's ``libero``, float64.
@@ -412,11 +455,11 @@ class Simulation:
         ``qpos`` and ``qvel`` (2,); ``joints``: ``pos`` and ``vel`` (7,).
         """
         position, rotation = self.eef_pose()
-        qpos, qvel, fingers, arm = self.data.qpos, self.data.qvel, self._finger_qpos, self._arm_qpos
-        return {  # arm and fingers come first in the model, so that qvel has their places of qpos
+        qpos, qvel = self.data.qpos.copy(), self.data.qvel.copy()
+        return {
             "eef": {"pos": position, "quat": self.data.xquat[self._hand, [1, 2, 3, 0]], "mat": rotation},
-            "gripper": {"qpos": qpos[fingers], "qvel": qvel[fingers]},
-            "joints": {"pos": qpos[arm], "vel": qvel[arm]},
+            "gripper": {"qpos": qpos[robot.FINGERS], "qvel": qvel[robot.FINGERS]},
+            "joints": {"pos": qpos[robot.ARM], "vel": qvel[robot.ARM]},
         }
 
     def eef_pose(self) -> tuple[Array, Array]:
@@ -440,12 +483,12 @@ class Simulation:
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""
-        fingers = self.data.qpos[self._finger_qpos]
-        return float(fingers[0] - fingers[1])
+        one, other = self.data.qpos[robot.FINGERS]
+        return float(one - other)
 
     def gripper_command(self) -> float:
         """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""
-        return float(self._controller.gripper @ CLOSING_SIGNS) / 2
+        return float(self._controller.gripper @ robot.CLOSING_SIGNS) / 2
 
     def body_pose(self, name: str) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of an instance or body."""

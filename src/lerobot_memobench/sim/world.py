@@ -1,12 +1,13 @@
 """Evaluate the atoms of the task language on the simulator's state.
 
 `World` evaluates predicates of the present state with LIBERO's semantics (paper, section 3.1). `StartState` evaluates
-predicates that compare the present state with the start of the execution.
+predicates that compare the present state with the start of the execution. `HiddenObjects` removes objects from a scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from math import isnan
 from typing import Any
 
@@ -17,11 +18,11 @@ from numpy.typing import NDArray
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.asset import COLLISION_GROUP, TABLE, Articulation, Asset
-from lerobot_memobench.sim.detents import DEAD_CENTRE
+from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-Vector = NDArray[np.float64]
+Array = NDArray[np.float64]
 
 ON_DISTANCE = 0.03
 """Horizontal distance of origins below which one object counts as on another, m."""
@@ -50,31 +51,6 @@ DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
 """Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 
 
-def in_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
-    """Return whether an origin is in a region.
-
-    LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
-
-    Args:
-        place: origin (3,), m.
-        position, rotation, size: pose and half sizes of the region's site, (3,), (3, 3) and (3,).
-    """
-    half = np.abs(rotation @ size)
-    low, high = position - half, position + half
-    low[2] -= IN_SLACK
-    return bool(np.all(place > low) and np.all(place < high))
-
-
-def over_region(place: Vector, position: Vector, rotation: Vector, size: Vector) -> bool:
-    """Return whether an origin is on top of a region, with or without contact; arguments as of `in_region`.
-
-    LIBERO applies the site's rotation where its inverse would be correct.
-    """
-    offset = rotation @ (place - position)
-    above = size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE
-    return bool(above and np.all(np.abs(offset[:2]) < size[:2]))
-
-
 class World:
     """Evaluate predicates of the present state of one simulation.
 
@@ -92,14 +68,8 @@ class World:
         self._table = len(self._instances)
         # Owner of each geom: the instance at the root of its body's tree, −1 for robot and room.
         roots = {model.body(name).id: index for name, index in self._instances.items()}
-        self._owner = np.full(model.ngeom, -1)
-        for geom in range(model.ngeom):
-            body = model.geom_bodyid[geom]
-            while body > 0 and body not in roots:
-                body = model.body_parentid[body]
-            self._owner[geom] = roots.get(body, -1)
-            if model.geom(geom).name.startswith(TABLE):
-                self._owner[geom] = self._table
+        self._owner = np.array([roots.get(int(root), -1) for root in model.body_rootid[model.geom_bodyid]])
+        self._owner[[model.geom(geom).name.startswith(TABLE) for geom in range(model.ngeom)]] = self._table
         self._owner[model.geom_group != COLLISION_GROUP] = -1
         self.joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
@@ -164,8 +134,13 @@ class World:
         return holds
 
     def _in(self, a: str, region: str) -> bool:
+        """LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`."""
         self._index(a)
-        return in_region(self._data.body(a).xpos, *self._box_of(region))
+        place, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
+        half = np.abs(rotation @ size)
+        low, high = position - half, position + half
+        low[2] -= IN_SLACK
+        return bool(np.all(place > low) and np.all(place < high))
 
     def _on_object(self, a: str, b: str) -> bool:
         self._index(a)
@@ -176,27 +151,24 @@ class World:
 
     def _on_site(self, a: str, region: str) -> bool:
         self._index(a)
-        if not over_region(self._data.body(a).xpos, *self._box_of(region)):
+        position, rotation, size = self._box_of(region)
+        # LIBERO applies the site's rotation where its inverse would be correct.
+        offset = rotation @ (self._data.body(a).xpos - position)
+        above = size[2] - ON_SITE_BELOW < offset[2] < size[2] + ON_SITE_ABOVE
+        if not (above and np.all(np.abs(offset[:2]) < size[:2])):
             return False
         declared = self._task.regions.get(region)
         on_table = declared is not None and declared.target not in self._instances
         return on_table or self.touching(a, self._owner_of(region))
 
-    def _box_of(self, region: str) -> tuple[Vector, Vector, Vector]:
+    def _box_of(self, region: str) -> tuple[Array, Array, Array]:
         """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
-        site = self._site(region)
-        return (
-            self._data.site_xpos[site].copy(),
-            self._data.site_xmat[site].reshape(3, 3),
-            self._model.site_size[site],
-        )
-
-    def _site(self, region: str) -> int:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
         if site < 0:
-            known = [self._model.site(i).name for i in range(self._model.nsite)]
-            raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, known)}")
-        return site
+            regions = [self._model.site(i).name for i in range(self._model.nsite)]
+            raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, regions)}")
+        data = self._data
+        return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._model.site_size[site]
 
     def _owner_of(self, region: str) -> str:
         return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
@@ -221,17 +193,15 @@ class StartState:
         objects: Sequence[str],
         joints: Mapping[str, tuple[Articulation, int]],
     ) -> None:
-        self._data = data
+        self._model, self._data = model, data
         self._grip = model.site(robot.GRIP_SITE).id
-        self._model = model
-        self._fingers = [int(model.joint(name).qposadr[0]) for name in robot.FINGER_JOINTS]
-        arm = np.arange(max(self._fingers) + 1)  # arm and fingers are first in the model, with one position a joint
+        arm = np.arange(robot.OTHERS.start)
         self._arm_indices = np.concatenate([arm, model.nq + arm])
-        self._previous: NDArray[np.float64] | None = None
+        self._previous: Array | None = None
         self._bodies = {name: int(model.body(name).id) for name in objects}
         self._joints = joints
-        self._places: dict[str, NDArray[np.float64]] = {}
-        self._turns: dict[str, NDArray[np.float64]] = {}
+        self._places: dict[str, Array] = {}
+        self._turns: dict[str, Array] = {}
         self.mark_hand()
         self.mark_scene()
 
@@ -241,7 +211,7 @@ class StartState:
         self._position, self._rotation, self._opening = self._hand()
 
     @property
-    def home(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def home(self) -> tuple[Array, Array]:
         """Position (3,) and rotation (3, 3) of the grip site at home."""
         return self._position, self._rotation
 
@@ -289,11 +259,11 @@ class StartState:
 
     def nearly_as_begun(self) -> bool:
         """Return whether all objects and joints are close enough to their start for the detent to restore them."""
-        return all(self._shift(name) <= DETENT_SHIFT and self._turn(name) <= DETENT_TURN for name in self._bodies) and (
-            all(self._joint_shift(name) <= DEAD_CENTRE[self._joints[name][0].kind] for name in self._joints)
+        return not any(self.left_dead_centre(name) for name in self._joints) and all(
+            self._shift(name) <= DETENT_SHIFT and self._turn(name) <= DETENT_TURN for name in self._bodies
         )
 
-    def _is_or_was_equal(self, state: NDArray[np.float64], part: Any = ...) -> bool:
+    def _is_or_was_equal(self, state: Array, part: Any = ...) -> bool:
         """Return whether part of the state equals ``state`` now or did at the beginning of the step."""
         states = [self._current_state()] if self._previous is None else [self._current_state(), self._previous]
         return any(bool(np.abs(one[part] - state).max() <= SAME_STATE) for one in states)
@@ -308,51 +278,97 @@ class StartState:
 
     def left_dead_centre(self, name: str) -> bool:
         """Return whether a joint is farther from its start than its detent reaches."""
-        return self._joint_shift(name) > DEAD_CENTRE[self._joints[name][0].kind]
+        joint, address = self._joints[name]
+        return abs(float(self._data.qpos[address] - self._start_state[address])) > DEAD_CENTRE[joint.kind]
 
     def _shift(self, name: str) -> float:
-        """Return the distance of an object from its start, m."""
         return float(np.linalg.norm(self._data.xpos[self._bodies[name]] - self._places[name]))
 
     def _turn(self, name: str) -> float:
-        """Return the angle of an object from its start, rad."""
         cosine = abs(float(self._data.xquat[self._bodies[name]] @ self._turns[name]))
         return 2.0 * float(np.arccos(min(cosine, 1.0)))
 
-    def _joint_shift(self, name: str) -> float:
-        """Return the distance of a joint from its start, m or rad."""
-        address = self._joints[name][1]
-        return abs(float(self._data.qpos[address] - self._start_state[address]))
-
-    def _current_state(self) -> NDArray[np.float64]:
-        """Return positions and velocities of the whole scene."""
+    def _current_state(self) -> Array:
         return np.append(self._data.qpos, self._data.qvel)
 
     def in_detent(self) -> bool:
         """Return whether the open hand is near home and at rest, so that the detent catches it."""
-        return self.at_detent() and bool(np.all(self._speed() <= DETENT_SPEED))
+        velocity = np.empty(6)  # angular part first
+        mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_SITE, self._grip, velocity, 0)
+        speed, turning = np.linalg.norm(velocity[3:]), np.linalg.norm(velocity[:3])
+        return self.at_detent() and bool(speed <= DETENT_SPEED[0] and turning <= DETENT_SPEED[1])
 
     def at_detent(self) -> bool:
         """Return whether the open hand is close enough to home for the detent, at any speed."""
-        distance, angle = self._from_home()
-        near = distance <= DETENT_DISTANCE and angle <= DETENT_ANGLE
-        return near and bool(np.all(np.abs(self._hand()[2] - self._opening) <= DETENT_OPENING))
-
-    def _from_home(self) -> tuple[float, float]:
-        """Return the distance (m) and the rotation (rad) of the hand from home."""
-        position, rotation, _ = self._hand()
+        position, rotation, opening = self._hand()
         cosine = (np.trace(self._rotation.T @ rotation) - 1.0) / 2.0
-        return float(np.linalg.norm(position - self._position)), float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        near = float(np.linalg.norm(position - self._position)) <= DETENT_DISTANCE
+        level = float(np.arccos(np.clip(cosine, -1.0, 1.0))) <= DETENT_ANGLE
+        return near and level and bool(np.all(np.abs(opening - self._opening) <= DETENT_OPENING))
 
-    def _speed(self) -> NDArray[np.float64]:
-        """Return the speed of the grip site (2,), m/s and rad/s."""
-        velocity = np.empty(6)  # angular part first
-        site = mujoco.mjtObj.mjOBJ_SITE
-        mujoco.mj_objectVelocity(self._model, self._data, site, self._grip, velocity, 0)
-        return np.array([np.linalg.norm(velocity[3:]), np.linalg.norm(velocity[:3])])
-
-    def _hand(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def _hand(self) -> tuple[Array, Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site, and finger positions (2,)."""
         data = self._data
         rotation = data.site_xmat[self._grip].reshape(3, 3).copy()
-        return data.site_xpos[self._grip].copy(), rotation, data.qpos[self._fingers].copy()
+        return data.site_xpos[self._grip].copy(), rotation, data.qpos[robot.FINGERS].copy()
+
+
+# --- hidden objects ---
+
+PARKING_HEIGHT = 1000.0
+"""Height of parked objects, m, plus 1 m times the body's number: outside the cameras' range, without contact."""
+
+
+@dataclass(frozen=True, eq=False)
+class HiddenObject:
+    """An absent object."""
+
+    name: str
+    region: str
+    """Region of its drawer."""
+    offset: Array
+    """Position relative to the region's site, (3,), m."""
+    quaternion: Array
+    """Orientation wxyz (4,)."""
+
+
+class HiddenObjects:
+    """Keep hidden objects outside a scene until their drawers open.
+
+    An object that a prompt hides must not be observable, not even by a camera inside the shut drawer or by a drawer
+    that moves otherwise. So it is parked far above the scene, at a position that is equal in all variants. The
+    simulation is therefore bit-identical between variants until a drawer that contains an object is ajar.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        self.absent: tuple[HiddenObject, ...] = ()
+        """Objects that are parked."""
+
+    def describe(self, name: str, region: str) -> HiddenObject:
+        """Return an object that rests in a drawer, with its present pose relative to the drawer."""
+        body, site = self._data.body(name), self._data.site(region)
+        return HiddenObject(name, region, body.xpos - site.xpos, body.xquat.copy())
+
+    def park(self) -> None:
+        """Write the poses of absent objects; the derived quantities of ``data`` are not updated."""
+        for hidden in self.absent:
+            height = PARKING_HEIGHT + self._model.body(hidden.name).id
+            self._write(hidden.name, np.array([0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0]), np.zeros(3))
+
+    def reveal(self, regions: Sequence[str]) -> list[str]:
+        """Put absent objects into the drawers of ``regions``, with the drawers' velocities; return their names."""
+        revealed = [hidden for hidden in self.absent if hidden.region in regions]
+        self.absent = tuple(hidden for hidden in self.absent if hidden not in revealed)
+        for hidden in revealed:
+            velocity = np.empty(6)  # angular part first
+            site = self._data.site(hidden.region)
+            mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_SITE, site.id, velocity, 0)
+            self._write(hidden.name, np.concatenate([site.xpos + hidden.offset, hidden.quaternion]), velocity[3:])
+        return [hidden.name for hidden in revealed]
+
+    def _write(self, name: str, pose: Array, velocity: Array) -> None:
+        joint = self._model.joint(int(self._model.body(name).jntadr[0]))
+        qpos, dof = int(joint.qposadr[0]), int(joint.dofadr[0])
+        self._data.qpos[qpos : qpos + 7] = pose
+        self._data.qvel[dof : dof + 6] = [*velocity, 0.0, 0.0, 0.0]

@@ -3,49 +3,50 @@
 A file holds ``(define (problem NAME) (:domain ..) (:language ..) (:regions ..) (:fixtures ..) (:objects ..)
 (:obj_of_interest ..) (:init ..) (:goal ..))``. Keywords and predicates are case-insensitive. Names keep their case;
 references to them ignore it. Unknown items raise an error with file and line, except a region on an undeclared target,
-which raises only when it is used.
+which raises only when it is used: LIBERO's files contain such regions.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import cut
 from lerobot_memobench.tasks.formula import (
     LATCHES,
     MAX_DEPTH,
+    OPERATORS,
     PREDICATES,
     SINCE_START,
     And,
     Atom,
+    Counted,
     Formula,
     atoms,
-    is_operator,
     make_atom,
     make_operator,
     rename,
-    takes_number,
 )
-from lerobot_memobench.tasks.sexpr import Node, Reader
 
 _SECTIONS = (":domain", ":language", ":regions", ":fixtures", ":objects", ":obj_of_interest", ":init", ":goal")
 _REQUIRED = (":language", ":fixtures", ":init", ":goal")
 _REGION = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
 _REGION_CLAUSES = (":target", ":ranges", ":yaw_rotation")
 _NOT_IN_INIT = {*LATCHES, *SINCE_START}
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _THING = ("object", "fixture")
-_JOINTED = ("fixture", "region")
 _KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
     "on": (_THING, (*_THING, "region")),
     "in": (_THING, ("region",)),
     "inplace": (("object",),),
     "lifted": (("object",),),
 }
-"""Predicate -> allowed kinds of each argument; other predicates take a joint (`_JOINTED`)."""
+"""Predicate -> allowed kinds of each argument; other predicates take a joint, a fixture or region."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,10 @@ class Problem:
         names = ("objects", "fixtures", "regions", "init", "objects_of_interest", "goal")
         return {name: getattr(self, name) for name in names}
 
-    def entity_kind(self, name: str) -> str | None:
-        """Return "object", "fixture", "region" or None."""
-        if name in self.objects:
-            return "object"
-        if name in self.fixtures:
-            return "fixture"
-        return "region" if name in self.regions else None
+    @property
+    def names(self) -> list[str]:
+        """Declared names; those of regions are ``<target>_<region>``."""
+        return [*self.objects, *self.fixtures, *self.regions]
 
     def resolve(self, formula: Formula, where: str) -> Formula:
         """Return ``formula`` with names in their declared spelling.
@@ -109,34 +107,112 @@ class Problem:
         Raises:
             MemobenchError: a name is not declared, or its kind does not fit the predicate.
         """
-        declared = {name.lower(): name for name in (*self.objects, *self.fixtures, *self.regions)}
+        declared = {name.lower(): name for name in self.names}
         spelling: dict[str, str] = {}
         for atom in atoms(formula):
             for position, arg in enumerate(atom.args):
                 if arg.lower() not in declared:
-                    self._check_unplaced(arg)
+                    for region, problem in self.unplaced.items():  # the target may have a typing error
+                        if arg.lower().endswith(f"_{region.name}".lower()):
+                            raise MemobenchError(problem)
                     raise MemobenchError(
                         f"{where}: found the name {arg!r}, which none of :objects, :fixtures and :regions "
                         f"(as <target>_<region>) declares, {nearest(arg, declared.values())}"
                     )
-                spelling[arg] = declared[arg.lower()]
-                self._check_kind(atom, position, spelling[arg], where)
+                name = spelling[arg] = declared[arg.lower()]
+                kind = "object" if name in self.objects else "fixture" if name in self.fixtures else "region"
+                allowed = _KINDS.get(atom.predicate, (("fixture", "region"),))[position]
+                if kind not in allowed:
+                    raise MemobenchError(
+                        f"{where}: found the {kind} {name!r} in {atom}, expected {' or '.join(allowed)} there"
+                    )
         return rename(formula, spelling)
 
-    def _check_unplaced(self, name: str) -> None:
-        """Raise if a name refers to a region on an undeclared target, with or without a typing error in the target."""
-        for region, problem in self.unplaced.items():
-            if name.lower().endswith(f"_{region.name}".lower()):
-                raise MemobenchError(problem)
 
-    def _check_kind(self, atom: Atom, position: int, name: str, where: str) -> None:
-        kind = self.entity_kind(name)
-        allowed = _KINDS.get(atom.predicate, (_JOINTED,))[position]
-        if kind not in allowed:
-            raise MemobenchError(f"{where}: found the {kind} {name!r} in {atom}, expected {' or '.join(allowed)} there")
+# --- S-expressions ---
 
 
-# --- reading ---
+@dataclass
+class _Node:
+    """A word (``items`` is None) or a list; ``start`` and ``end`` delimit its source text."""
+
+    path: str
+    line: int
+    start: int
+    end: int = -1
+    word: str = ""
+    items: list[_Node] | None = None
+
+    def __str__(self) -> str:
+        if self.items is None:
+            return repr(cut(self.word, 40))
+        return f"a list ({self.items[0].word[:40]} ...)" if self.items else "an empty list ()"
+
+    @property
+    def where(self) -> str:
+        return f"{self.path}, line {self.line}"
+
+    def error(self, found: str, expected: str) -> MemobenchError:
+        return MemobenchError(f"{self.where}: found {found}, expected {expected}")
+
+    def text(self, expected: str) -> str:
+        """Return the word; raise for a list."""
+        if self.items is not None:
+            raise self.error(str(self), expected)
+        return self.word
+
+    def sequence(self, expected: str) -> list[_Node]:
+        """Return the items of the list; raise for a word."""
+        if self.items is None:
+            raise self.error(str(self), expected)
+        return self.items
+
+    def head(self, expected: str) -> tuple[str, list[_Node]]:
+        """Split a list into its first word (lower case) and the rest."""
+        items = self.sequence(expected)
+        if not items:
+            raise self.error("an empty list ()", expected)
+        return items[0].text(expected).lower(), items[1:]
+
+    def numbers(self, count: int, expected: str) -> list[float]:
+        """Return the ``count`` finite numbers of the list."""
+        items = self.sequence(expected)
+        if len(items) != count:
+            raise self.error(f"{len(items)} value(s)", expected)
+        for item in items:
+            text = item.text(expected)
+            if not _NUMBER.fullmatch(text) or not math.isfinite(float(text)):
+                raise item.error(repr(text), f"a finite number ({expected})")
+        return [float(item.word) for item in items]
+
+
+def _parse(text: str, path: str) -> _Node:
+    """Return the single top-level list. The parser is iterative, so deep nesting cannot overflow the stack."""
+    found: list[_Node] = []
+    root = _Node(path, line=1, start=0, items=found)
+    stack, line, last = [root], 1, 0
+    for match in re.finditer(r"[()]|[^\s()]+", text):
+        line += text.count("\n", last, match.start())
+        last = match.start()
+        node = _Node(path, line, match.start(), match.end(), match.group())
+        if node.word == ")":
+            if len(stack) == 1:  # the root is no list of the file
+                raise node.error("an unmatched ')'", "'(' before it or the end of the file")
+            stack.pop().end = match.end()
+            continue
+        stack[-1].sequence("a list").append(node)
+        if node.word == "(":
+            node.word, node.items = "", []
+            stack.append(node)
+    if len(stack) > 1:
+        raise stack[-1].error("a '(' that is never closed", "a ')' for it before the end of the file")
+    if len(found) != 1 or found[0].items is None:
+        node = found[1] if len(found) > 1 else (found or [root])[0]
+        raise node.error(str(node) if found else "no text", "exactly one list (define (problem NAME) ...)")
+    return found[0]
+
+
+# --- problems ---
 
 
 def parse_bddl(text: str, path: object = "<text>") -> Problem:
@@ -146,302 +222,223 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
         MemobenchError: with file, line, the unexpected item and the expected one.
     """
     # Replace comments by spaces to preserve offsets and line numbers.
-    blanked = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
-    reader = Reader(str(path), blanked)
-    root = reader.read()
-    name, nodes = _problem(reader, root)
-    sections = _sections(reader, root, nodes)
-    problem = _declared(reader, name, sections)
-    # Goal and initial state refer to the declarations, so they are parsed last.
-    goals = _items(sections, ":goal")
-    if len(goals) != 1:
-        raise reader.error(sections[":goal"], f"{len(goals)} formulas in :goal", "exactly one")
-    return replace(problem, goal=_formula(reader, problem, goals[0]), init=_init(reader, problem, sections[":init"]))
-
-
-def _problem(reader: Reader, root: Node) -> tuple[str, list[Node]]:
-    """Return the problem's name and its section nodes."""
-    expected = "(define (problem NAME) ...)"
-    head, rest = reader.head(root, expected)
-    if head != "define" or not rest:
-        raise reader.error(root, f"({head} ...)", expected)
-    head, words = reader.head(rest[0], "(problem NAME)")
-    if head != "problem" or len(words) != 1:
-        raise reader.error(rest[0], str(rest[0]), "(problem NAME)")
-    return reader.word(words[0], "(problem NAME)"), rest[1:]
-
-
-def _sections(reader: Reader, root: Node, nodes: list[Node]) -> dict[str, Node]:
-    sections: dict[str, Node] = {}
-    for node in nodes:
-        key, _ = reader.head(node, "a section such as (:objects ...)")
-        if key not in _SECTIONS:
-            raise reader.error(node, f"the unknown section {key!r}", f"one of {', '.join(_SECTIONS)}")
-        if key in sections:
-            raise reader.error(node, f"a second {key}", f"one, as on line {sections[key].line}")
-        sections[key] = node
-    missing = [key for key in _REQUIRED if key not in sections]
-    if missing:
-        raise reader.error(root, f"no {' or '.join(missing)} section", f"all of {', '.join(_REQUIRED)}")
-    return sections
-
-
-def _items(sections: dict[str, Node], key: str) -> list[Node]:
-    return (sections[key].items or [])[1:] if key in sections else []
-
-
-def _declared(reader: Reader, name: str, sections: dict[str, Node]) -> Problem:
-    """Return the problem with its declarations; initial state and goal are empty."""
-    names = _Names(reader)
-    fixtures = _declarations(reader, _items(sections, ":fixtures"), names)
-    objects = _declarations(reader, _items(sections, ":objects"), names)
-    regions, unplaced = _regions(reader, _items(sections, ":regions"), names)
-    return Problem(
+    text = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
+    root = _parse(text, str(path))
+    name, sections = _sections(root)
+    items = {key: sections[key].sequence(key)[1:] if key in sections else [] for key in _SECTIONS}
+    names = _Names()
+    problem = Problem(
         name=name,
-        domain=_domain(reader, sections.get(":domain")),
-        language=_language(reader, sections[":language"]),
-        objects=objects,
-        fixtures=fixtures,
-        regions=regions,
-        objects_of_interest=_of_interest(reader, _items(sections, ":obj_of_interest"), names),
+        domain="",
+        language=_language(text, sections[":language"]),
+        fixtures=_declarations(items[":fixtures"], names),
+        objects=_declarations(items[":objects"], names),
+        regions={},
+        objects_of_interest=(),
         init=(),
         goal=And(()),
-        unplaced=unplaced,
+    )
+    targets = names.spelling()
+    for node in items[":regions"]:
+        region, fault = _region(node, targets)
+        if fault is not None:
+            problem.unplaced[region] = fault
+            continue
+        names.declare(node, region.full_name, "the region")
+        problem.regions[region.full_name] = region
+    # These refer to the declarations, so they are parsed last.
+    if ":domain" in sections and len(items[":domain"]) != 1:
+        raise sections[":domain"].error(f"{len(items[':domain'])} words in :domain", "one name")
+    if len(items[":goal"]) != 1:
+        raise sections[":goal"].error(f"{len(items[':goal'])} formulas in :goal", "exactly one")
+    return replace(
+        problem,
+        domain=items[":domain"][0].text("a domain name") if items[":domain"] else "",
+        objects_of_interest=tuple(names.declared(node) for node in items[":obj_of_interest"]),
+        goal=_formula(problem, items[":goal"][0]),
+        init=_init(problem, sections[":init"]),
     )
 
 
-def _domain(reader: Reader, node: Node | None) -> str:
-    if node is None:
-        return ""
-    items = reader.sequence(node, "(:domain NAME)")[1:]
-    if len(items) != 1:
-        raise reader.error(node, f"{len(items)} words in :domain", "one name")
-    return reader.word(items[0], "a domain name")
+def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
+    """Return the problem's name and its sections."""
+    expected = "(define (problem NAME) ...)"
+    head, rest = root.head(expected)
+    if head != "define" or not rest:
+        raise root.error(f"({head} ...)", expected)
+    head, words = rest[0].head("(problem NAME)")
+    if head != "problem" or len(words) != 1:
+        raise rest[0].error(str(rest[0]), "(problem NAME)")
+    sections: dict[str, _Node] = {}
+    for node in rest[1:]:
+        key, _ = node.head("a section such as (:objects ...)")
+        if key not in _SECTIONS:
+            raise node.error(f"the unknown section {key!r}", f"one of {', '.join(_SECTIONS)}")
+        if key in sections:
+            raise node.error(f"a second {key}", f"one, as on line {sections[key].line}")
+        sections[key] = node
+    if missing := [key for key in _REQUIRED if key not in sections]:
+        raise root.error(f"no {' or '.join(missing)} section", f"all of {', '.join(_REQUIRED)}")
+    return words[0].text("(problem NAME)"), sections
 
 
-def _language(reader: Reader, node: Node) -> str:
+def _language(text: str, section: _Node) -> str:
     """Return the free text with white space collapsed; it may contain commas, dots and balanced parentheses."""
-    assert node.items is not None
-    language = " ".join(reader.text[node.items[0].end : node.end - 1].split())
+    language = " ".join(text[section.sequence(":language")[0].end : section.end - 1].split())
     if not language:
-        raise reader.error(node, "an empty :language", "the instruction of the task in words")
+        raise section.error("an empty :language", "the instruction of the task in words")
     return language
 
 
-def _declarations(reader: Reader, nodes: list[Node], names: _Names) -> dict[str, str]:
+class _Names:
+    """Case-insensitive registry of declared names; rejects names that differ only in case."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[str, tuple[str, str]] = {}
+
+    def declare(self, node: _Node, name: str, kind: str) -> None:
+        """Add a name; ``kind`` describes it in the error for a second declaration."""
+        if name.lower() in self._kinds:
+            first = " ".join(self._kinds[name.lower()])
+            raise node.error(f"the name {name!r} declared again", f"another name, because {first} exists")
+        self._kinds[name.lower()] = (kind, name)
+
+    def spelling(self) -> dict[str, str]:
+        """Return lower-case name -> declared name."""
+        return {key: name for key, (_, name) in self._kinds.items()}
+
+    def declared(self, node: _Node) -> str:
+        """Return the declared spelling of a name of interest."""
+        known, name = self.spelling(), node.text("a declared name")
+        if name.lower() not in known:
+            raise node.error(f"{name!r} in :obj_of_interest", f"a declared name, {nearest(name, known.values())}")
+        return known[name.lower()]
+
+
+def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
     """Parse ``a b - class c - class`` into {instance: class}."""
     expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
     declared: dict[str, str] = {}
-    waiting: list[Node] = []
+    waiting: list[_Node] = []
     following = iter(nodes)
     for node in following:
-        if reader.word(node, expected) != "-":
+        if node.text(expected) != "-":
             waiting.append(node)
             continue
         class_node = next(following, None)
         class_name = class_node.word if class_node else ""
         if not waiting or class_name in ("", "-"):
             lacking = "a class after it" if waiting else "a name before it"
-            raise reader.error(node, f"a '-' without {lacking}", expected)
+            raise node.error(f"a '-' without {lacking}", expected)
         for name in waiting:
             names.declare(name, name.word, f"the {class_name}")
             declared[name.word] = class_name
         waiting = []
     if waiting:
-        raise reader.error(waiting[0], f"{waiting[0].word!r} without a class", expected)
+        raise waiting[0].error(f"{waiting[0].word!r} without a class", expected)
     return declared
 
 
-def _of_interest(reader: Reader, nodes: list[Node], names: _Names) -> tuple[str, ...]:
-    known = names.spelling()
-    found = []
-    for node in nodes:
-        name = reader.word(node, "a declared name")
-        if name.lower() not in known:
-            hint = nearest(name, known.values())
-            raise reader.error(node, f"{name!r} in :obj_of_interest", f"a declared name, {hint}")
-        found.append(known[name.lower()])
-    return tuple(found)
-
-
-class _Names:
-    """Case-insensitive registry of declared names; rejects names that differ only in case."""
-
-    def __init__(self, reader: Reader) -> None:
-        self._reader = reader
-        self._declared: dict[str, tuple[str, str]] = {}
-
-    def declare(self, node: Node, name: str, kind: str) -> None:
-        """Add the name declared at ``node``; ``kind`` describes it in the error for a second declaration."""
-        if name.lower() in self._declared:
-            first = " ".join(self._declared[name.lower()])
-            expected = f"another name, because {first} exists"
-            raise self._reader.error(node, f"the name {name!r} declared again", expected)
-        self._declared[name.lower()] = (kind, name)
-
-    def spelling(self) -> dict[str, str]:
-        """Return lower-case name -> declared name."""
-        return {key: name for key, (_, name) in self._declared.items()}
-
-
-# --- regions ---
-
-
-def _regions(reader: Reader, nodes: list[Node], names: _Names) -> tuple[dict[str, Region], dict[Region, str]]:
-    """Declare the regions; return full name -> region, and unplaced region -> error message.
-
-    LIBERO's files contain unused regions on undeclared targets.
-    """
-    regions: dict[str, Region] = {}
-    unplaced: dict[Region, str] = {}
-    targets = names.spelling()
-    for node in nodes:
-        region, problem = _region(reader, node, targets)
-        if problem is not None:
-            unplaced[region] = problem
-            continue
-        names.declare(node, region.full_name, "the region")
-        regions[region.full_name] = region
-    return regions, unplaced
-
-
-def _region(reader: Reader, node: Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
+def _region(node: _Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
     """Return a region, and the error message for an undeclared target."""
-    items = reader.sequence(node, _REGION)
+    items = node.sequence(_REGION)
     if not items:
-        raise reader.error(node, "an empty list ()", _REGION)
-    name = reader.word(items[0], _REGION)
-    target = problem = None
-    ranges: list[tuple[float, float, float, float]] = []
-    yaw = (0.0, 0.0)
-    seen: set[str] = set()
+        raise node.error("an empty list ()", _REGION)
+    name = items[0].text(_REGION)
+    clauses: dict[str, tuple[_Node, _Node]] = {}
     for clause in items[1:]:
-        key, value = _clause(reader, clause, name, seen)
-        if key == ":target":
-            target, problem = _target(reader, clause, value, name, targets)
-        elif key == ":ranges":
-            ranges = _ranges(reader, clause, value, name)
-        else:
-            yaw = _yaw(reader, clause, value, name)
-    if target is None:
-        raise reader.error(node, f"region {name!r} without (:target ...)", _REGION)
-    return Region(name, target, tuple(ranges), yaw), problem
+        key, values = clause.head("(:target ...), (:ranges ...) or (:yaw_rotation ...)")
+        if key in clauses:
+            raise clause.error(f"a second {key} in region {name!r}", "one")
+        if key not in _REGION_CLAUSES:
+            raise clause.error(f"the unknown clause {key!r} in region {name!r}", ":target, :ranges or :yaw_rotation")
+        if len(values) != 1:
+            raise clause.error(f"{len(values)} values in {key} of region {name!r}", "one")
+        clauses[key] = clause, values[0]
+    if ":target" not in clauses:
+        raise node.error(f"region {name!r} without (:target ...)", _REGION)
+    ranges = _ranges(*clauses[":ranges"], name) if ":ranges" in clauses else ()
+    yaw = _yaw(*clauses[":yaw_rotation"], name) if ":yaw_rotation" in clauses else (0.0, 0.0)
+    clause, value = clauses[":target"]
+    target, problem = value.text("the name of a fixture or object"), None
+    if target.lower() not in targets:
+        found = f"the target {target!r} of region {name!r}, which is not declared"
+        expected = f"a name from :fixtures or :objects, {nearest(target, targets.values())}"
+        problem = str(clause.error(found, expected))
+    return Region(name, targets.get(target.lower(), target), ranges, yaw), problem
 
 
-def _clause(reader: Reader, clause: Node, name: str, seen: set[str]) -> tuple[str, Node]:
-    """Return a clause's keyword and value; add the keyword to ``seen``, which rejects duplicates."""
-    key, values = reader.head(clause, "(:target ...), (:ranges ...) or (:yaw_rotation ...)")
-    if key in seen:
-        raise reader.error(clause, f"a second {key} in region {name!r}", "one")
-    if key not in _REGION_CLAUSES:
-        found = f"the unknown clause {key!r} in region {name!r}"
-        raise reader.error(clause, found, ":target, :ranges or :yaw_rotation")
-    seen.add(key)
-    if len(values) != 1:
-        raise reader.error(clause, f"{len(values)} values in {key} of region {name!r}", "one")
-    return key, values[0]
-
-
-def _target(reader: Reader, clause: Node, value: Node, name: str, targets: Mapping[str, str]) -> tuple[str, str | None]:
-    """Return a target in its declared spelling; for an undeclared one the given spelling and the error message."""
-    given = reader.word(value, "the name of a fixture or object")
-    if given.lower() in targets:
-        return targets[given.lower()], None
-    expected = f"a name from :fixtures or :objects, {nearest(given, targets.values())}"
-    found = f"the target {given!r} of region {name!r}, which is not declared"
-    return given, str(reader.error(clause, found, expected))
-
-
-def _ranges(reader: Reader, clause: Node, value: Node, name: str) -> list[tuple[float, float, float, float]]:
+def _ranges(clause: _Node, value: _Node, name: str) -> tuple[tuple[float, float, float, float], ...]:
     ranges = []
-    for box in reader.sequence(value, "a list of (x1 y1 x2 y2)"):
-        x1, y1, x2, y2 = reader.numbers(box, 4, "x1 y1 x2 y2 in metres")
+    for box in value.sequence("a list of (x1 y1 x2 y2)"):
+        x1, y1, x2, y2 = box.numbers(4, "x1 y1 x2 y2 in metres")
         if x1 > x2 or y1 > y2:
-            raise reader.error(box, f"the range ({x1} {y1} {x2} {y2})", "x1 <= x2 and y1 <= y2")
+            raise box.error(f"the range ({x1} {y1} {x2} {y2})", "x1 <= x2 and y1 <= y2")
         ranges.append((x1, y1, x2, y2))
     if not ranges:
-        raise reader.error(clause, f"empty :ranges in region {name!r}", "at least one (x1 y1 x2 y2)")
-    return ranges
+        raise clause.error(f"empty :ranges in region {name!r}", "at least one (x1 y1 x2 y2)")
+    return tuple(ranges)
 
 
-def _yaw(reader: Reader, clause: Node, value: Node, name: str) -> tuple[float, float]:
-    pairs = reader.sequence(value, "a list of one (low high)")
+def _yaw(clause: _Node, value: _Node, name: str) -> tuple[float, float]:
+    pairs = value.sequence("a list of one (low high)")
     if len(pairs) != 1:
-        raise reader.error(clause, f"{len(pairs)} yaw intervals in region {name!r}", "one (low high)")
-    low, high = reader.numbers(pairs[0], 2, "low high in radians")
+        raise clause.error(f"{len(pairs)} yaw intervals in region {name!r}", "one (low high)")
+    low, high = pairs[0].numbers(2, "low high in radians")
     if low > high:
-        raise reader.error(pairs[0], f"the yaw interval ({low} {high})", "low <= high")
+        raise pairs[0].error(f"the yaw interval ({low} {high})", "low <= high")
     return low, high
 
 
 # --- goal and initial state ---
 
 
-def _formula(reader: Reader, problem: Problem, node: Node, depth: int = 0) -> Formula:
-    expected = "a formula such as (On a b) or (And ...)"
+def _formula(problem: Problem, node: _Node, depth: int = 0) -> Formula:
     if depth > MAX_DEPTH:
-        raise reader.error(node, f"a formula nested deeper than {MAX_DEPTH} levels", "a flatter one")
-    head, rest = reader.head(node, expected)
-    where = reader.where(node)
-    if is_operator(head):
-        number = _number(rest.pop(0).word) if takes_number(head) and rest and rest[0].items is None else None
-        return make_operator(head, [_formula(reader, problem, item, depth + 1) for item in rest], where, number)
-    assert node.items is not None
-    args = [reader.word(item, f"an entity name as argument of {node.items[0].word}") for item in rest]
-    return problem.resolve(make_atom(node.items[0].word, args, where), where)
+        raise node.error(f"a formula nested deeper than {MAX_DEPTH} levels", "a flatter one")
+    head, rest = node.head("a formula such as (On a b) or (And ...)")
+    if (operator := OPERATORS.get(head)) is not None:
+        number: int | str | None = None
+        if issubclass(operator, Counted) and rest and rest[0].items is None:
+            word = rest.pop(0).word
+            number = int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
+        return make_operator(operator, [_formula(problem, item, depth + 1) for item in rest], node.where, number)
+    predicate = node.sequence("")[0].word
+    args = [item.text(f"an entity name as argument of {predicate}") for item in rest]
+    return problem.resolve(make_atom(predicate, args, node.where), node.where)
 
 
-def _number(word: str) -> int | str:
-    """Return a word as an integer, or unchanged if it is not one."""
-    return int(word) if word.isascii() and word.isdigit() and len(word) < 10 else word
-
-
-def _init(reader: Reader, problem: Problem, section: Node) -> tuple[Atom, ...]:
+def _init(problem: Problem, section: _Node) -> tuple[Atom, ...]:
     """Return the initial state: atoms only, each object placed once, no cycle of supports."""
     found: list[Atom] = []
     support: dict[str, str] = {}
-    for node in (section.items or [])[1:]:
-        atom = _init_atom(reader, problem, node)
+    for node in section.sequence(":init")[1:]:
+        head, _ = node.head("an atom such as (On a b)")
+        if head in OPERATORS or head in _NOT_IN_INIT:
+            allowed = ", ".join(spelling for key, (spelling, _) in PREDICATES.items() if key not in _NOT_IN_INIT)
+            raise node.error(f"{head!r} in :init", f"one of {allowed}")
+        atom = _formula(problem, node)
+        assert isinstance(atom, Atom)
         found.append(atom)
-        if atom.predicate in ("on", "in"):
-            thing, place = atom.args
-            if thing in support:
-                raise reader.error(node, f"a second place for {thing!r}", "one place per object in :init")
-            support[thing] = problem.regions[place].target if place in problem.regions else place
-            _check_ranges(reader, problem, node, thing, place)
+        if atom.predicate not in ("on", "in"):
+            continue
+        thing, place = atom.args
+        if thing in support:
+            raise node.error(f"a second place for {thing!r}", "one place per object in :init")
+        region = problem.regions.get(place)
+        support[thing] = region.target if region else place
+        if region and not region.ranges and "table" in problem.fixtures.get(region.target, ""):
+            raise node.error(
+                f"{thing!r} on region {region.name!r} without :ranges", "a region with :ranges on the table"
+            )
     for name in problem.objects:
         if name not in support:
-            expected = f"(On {name} ...) or (In {name} ...)"
-            raise reader.error(section, f"no place for the object {name!r} in :init", expected)
-    _check_bottom(reader, section, support)
-    return tuple(found)
-
-
-def _init_atom(reader: Reader, problem: Problem, node: Node) -> Atom:
-    head, _ = reader.head(node, "an atom such as (On a b)")
-    if is_operator(head) or head in _NOT_IN_INIT:
-        allowed = ", ".join(spelling for key, (spelling, _) in PREDICATES.items() if key not in _NOT_IN_INIT)
-        raise reader.error(node, f"{head!r} in :init", f"one of {allowed}")
-    atom = _formula(reader, problem, node)
-    assert isinstance(atom, Atom)
-    return atom
-
-
-def _check_ranges(reader: Reader, problem: Problem, node: Node, thing: str, place: str) -> None:
-    """Raise if ``thing`` starts on a table region without ranges."""
-    region = problem.regions.get(place)
-    if region and not region.ranges and "table" in problem.fixtures.get(region.target, ""):
-        found = f"{thing!r} on region {region.name!r} without :ranges"
-        raise reader.error(node, found, "a region with :ranges on the table")
-
-
-def _check_bottom(reader: Reader, section: Node, support: Mapping[str, str]) -> None:
-    """Raise if the supports of a thing form a cycle."""
+            raise section.error(f"no place for the object {name!r} in :init", f"(On {name} ...) or (In {name} ...)")
     for name in support:
         chain, below = [name], support.get(name)
         while below is not None:
             if below in chain:
-                found = f"{name!r} resting on itself through {below!r} in :init"
-                raise reader.error(section, found, "a fixture at the bottom")
+                raise section.error(f"{name!r} resting on itself through {below!r} in :init", "a fixture at the bottom")
             chain.append(below)
             below = support.get(below)
+    return tuple(found)

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.io import files_below, spelled
+from lerobot_memobench.io import files_below, refusing, spelled
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
 from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
-from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_id, libero_suite_of, libero_tasks
-from lerobot_memobench.tasks.metadata import Metadata, read_text
+from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_tasks
+from lerobot_memobench.tasks.metadata import Metadata
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
     LIBERO_SUITES,
@@ -35,18 +34,12 @@ from lerobot_memobench.tasks.task import (
     Task,
 )
 
-#: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over both suites.
+#: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over all suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
 
 ALL_SUITES: tuple[str, ...] = (*SUITES, *LIBERO_SUITES)
 GROUPS: tuple[str, ...] = (*MEMORY_TYPES, *LIBERO_SUITES)
 """Groups of tasks in reports, and LeRobot's suites: memory types, and the suites of LIBERO."""
-
-TASK_NUMBERS = re.compile(r"(\d+)(?:-(\d+))?")
-"""A task number, or an inclusive range of numbers."""
-
-NUMERIC_ENTRY = re.compile(r"[\d -]*[\d-]")
-"""An entry of digits, spaces and hyphens only; reported as a malformed number or range if it is not one."""
 
 DEMO_TASK = "put_the_butter_into_the_bowl_from_the_prompt_video"
 """Short task of the demo: only the demonstration prompt shows which of three bowls is correct."""
@@ -62,67 +55,76 @@ _ROUTINE_WORDS = ("procedure", "sequence", "routine", "follow", "step", "order")
 # --- the catalogue ---
 
 
-@lru_cache(maxsize=1)
-def _folders() -> dict[str, Path]:
-    """Task name -> folder, by suite, memory type (temporal, spatial, object, procedural), then by name."""
-    found: dict[str, Path] = {}
-    for suite in SUITES:
-        for memory_type in MEMORY_TYPES:
-            for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir(), key=lambda path: path.name):
-                if (folder / BDDL_FILE).is_file():
-                    found[folder.name] = folder
+class _Entry(NamedTuple):
+    suite: str
+    group: str
+    number: int
+    folder: Path
+
+
+@cache
+def _entries() -> dict[str, _Entry]:
+    """Task name -> entry, by suite, memory type (temporal, spatial, object, procedural), then by name."""
+    folders = [
+        folder
+        for suite in SUITES
+        for memory_type in MEMORY_TYPES
+        for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir())
+        if (folder / BDDL_FILE).is_file()
+    ]
+    found = {each.name: _Entry(each.parents[1].name, each.parent.name, k, each) for k, each in enumerate(folders)}
+    for suite in LIBERO_SUITES:
+        place = LIBERO_FOLDER / f"{suite}.zip"
+        found |= {name: _Entry(suite, suite, k, place / name) for k, name in enumerate(libero_tasks(suite))}
     return found
+
+
+def _entry(name: str) -> _Entry:
+    if name not in _entries():
+        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, _entries())}")
+    return _entries()[name]
 
 
 def suite_of(name: str) -> str | None:
     """Return the suite of a catalogue task, None for an unknown name."""
-    return _folders()[name].parent.parent.name if name in _folders() else libero_suite_of(name)
+    return _entries()[name].suite if name in _entries() else None
 
 
 def group_of(name: str) -> str:
     """Return the memory type of a catalogue task, for a task of LIBERO its suite; raises as `task_folder`."""
-    return libero_suite_of(name) or task_folder(name).parent.name
+    return _entry(name).group
 
 
-def check_suite(suite: str) -> str:
-    """Return ``suite``; raise `MemobenchError` if it is unknown."""
-    check_choice("suite", suite, ALL_SUITES)
-    return suite
-
-
-def task_names(memory_types: str | Iterable[str] | None = None, suite: str | None = PUBLISHED) -> list[str]:
-    """Return the names of a suite's tasks in catalogue order, optionally of some memory types only.
+def task_names(memory_type: str | None = None, suite: str | None = PUBLISHED) -> list[str]:
+    """Return the names of a suite's tasks in catalogue order, optionally of one memory type only.
 
     ``suite=None`` selects the published suite and the strict one.
     """
-    if suite in LIBERO_SUITES:
-        names = [*libero_tasks(suite)]
-    else:
-        names = [name for name in _folders() if suite is None or suite_of(name) == check_suite(suite)]
-    if memory_types is None:
-        return names
-    wanted = [memory_types] if isinstance(memory_types, str) else list(memory_types)
-    for memory_type in wanted:
-        if memory_type not in MEMORY_TYPES:
-            raise MemobenchError(f"found the memory type {memory_type!r}, expected one of {', '.join(MEMORY_TYPES)}")
-    return [name for name in names if group_of(name) in wanted]
+    if suite is not None:
+        check_choice("suite", suite, ALL_SUITES)
+    if memory_type is not None:
+        check_choice("memory type", memory_type, MEMORY_TYPES)
+    suites = SUITES if suite is None else (suite,)
+    return [
+        name
+        for name, entry in _entries().items()
+        if entry.suite in suites and (memory_type is None or entry.group == memory_type)
+    ]
 
 
 def task_index(name: str) -> int:
     """Return the stable index of a task: its position in ``task_names(suite=None)``, or LIBERO's id."""
-    found = libero_id(name)
-    return list(_folders()).index(task_folder(name).name) if found is None else found
-
-
-def first_number(suite: str) -> int:
-    """Return the number of a suite's first task: LIBERO's ids begin with 0."""
-    return 0 if suite in LIBERO_SUITES else 1
+    return _entry(name).number
 
 
 def task_number(name: str) -> int:
-    """Return the number of a task within its suite, in catalogue order."""
-    suite = libero_suite_of(name) or task_folder(name).parent.parent.name
-    return task_names(suite=suite).index(name) + first_number(suite)
+    """Return the number of a task within its suite, in catalogue order; LIBERO's begin with 0."""
+    suite = _entry(name).suite
+    return task_names(suite=suite).index(name) + _first_number(suite)
+
+
+def _first_number(suite: str) -> int:
+    return 0 if suite in LIBERO_SUITES else 1
 
 
 def task_folder(name: str) -> Path:
@@ -131,12 +133,7 @@ def task_folder(name: str) -> Path:
     Raises:
         MemobenchError: the name is unknown; the nearest names are given.
     """
-    if libero_suite_of(name) is not None:
-        return get_libero_task(name).folder
-    if name not in _folders():
-        known = [*_folders(), *(each for suite in LIBERO_SUITES for each in libero_tasks(suite))]
-        raise MemobenchError(f"found no task named {name!r} in the catalogue, {nearest(name, known)}")
-    return _folders()[name]
+    return _entry(name).folder
 
 
 @cache
@@ -145,53 +142,69 @@ def get_task(name: str) -> Task:
     return load_task(task_folder(name))
 
 
-def resolve_tasks(spec: str | Iterable[str], suite: str = PUBLISHED) -> list[str]:
+def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
     """Return the task names selected by "all", memory types, names, numbers, or a comma-separated list of these.
 
     A number (`task_number`) or a range, such as ``12`` or ``3-7``, selects tasks of the suite. LIBERO's suites have no
     memory types. Names that contain commas are recognised. The given order is kept; repetitions are dropped.
     """
-    check_suite(suite)
-    if not isinstance(spec, str):
-        spec = list(spec)
-        _check_all_alone(spec)
-        return list(dict.fromkeys(name for part in spec for name in resolve_tasks(part, suite)))
-    pieces = spec.split(",")
-    _check_all_alone(pieces)
+    known = task_names(suite=suite)
+    text = spec
+    for name in (name for name in _entries() if "," in name):  # its commas separate nothing
+        text = text.replace(name, name.replace(",", "\0"))
+    words = [word.replace("\0", ",").strip() for word in text.split(",")]
+    if len(words) > 1 and "all" in words:
+        raise MemobenchError(
+            f"found 'all' with other entries among the tasks, {spec!r}; name either 'all' or the others"
+        )
+    types = MEMORY_TYPES if suite in SUITES else ()
+    listing = "memobench tasks" if suite == PUBLISHED else f"memobench tasks --suite {suite}"
     chosen: list[str] = []
-    start = 0
-    while start < len(pieces):
-        for end in range(len(pieces), start, -1):
-            word = ",".join(pieces[start:end]).strip()
-            found = _expand(word, suite)
-            if found:
-                chosen += found
-                start = end
-                break
+    for word in words:
+        if not word:
+            given = "no name" if not spec.strip() else f"an empty entry in {spec!r}"
+            raise MemobenchError(
+                f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
+                "single commas"
+            )
+        if word == "all" or word in known:
+            chosen += known if word == "all" else [word]
+        elif word in types:
+            chosen += task_names(word, suite)
+        elif re.fullmatch(r"[\d -]*[\d-]", word):  # also a malformed number or range
+            chosen += _numbered(word, known, suite, listing)
+        elif word in ALL_SUITES:
+            raise MemobenchError(f"{word!r} is a suite, no task; set suite={word}, or --suite {word}")
+        elif (own := suite_of(word)) is not None:
+            raise MemobenchError(f"{word!r} is a task of the {own} suite; set suite={own}, or --suite {own}")
         else:
-            word = pieces[start].strip()
-            if not word:
-                given = "no name" if not spec.strip() else f"an empty entry in {spec!r}"
-                raise MemobenchError(
-                    f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
-                    "single commas"
-                )
-            types = MEMORY_TYPES if suite in SUITES else ()
-            hint = nearest(word, ["all", *types, *task_names(suite=suite), *LIBERO_SUITES])
+            hint = nearest(word, ["all", *types, *known, *LIBERO_SUITES])
             raise MemobenchError(
                 f"found {word!r} among the tasks, expected 'all', "
                 f"{f'a memory type ({", ".join(types)}), ' if types else ''}or a task's name or number "
-                f"(`{_listing(suite)}` lists them), {hint}"
+                f"(`{listing}` lists them), {hint}"
             )
     return list(dict.fromkeys(chosen))
+
+
+def _numbered(word: str, names: list[str], suite: str, listing: str) -> list[str]:
+    """Return the tasks of a number, or of an inclusive range of numbers."""
+    numbers, lowest = re.fullmatch(r"(\d+)(?:-(\d+))?", word), _first_number(suite)
+    first, last = (-1, -1) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
+    if not lowest <= first <= last < lowest + len(names):
+        reversed_range = "the range is reversed; " if first > last else ""
+        problem = "this is not a complete range; " if numbers is None else reversed_range
+        raise MemobenchError(
+            f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered {lowest} to "
+            f"{lowest + len(names) - 1}, an example of a range is 3-7 (`{listing}` lists them)"
+        )
+    return names[first - lowest : last - lowest + 1]
 
 
 def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> tuple[tuple[str, ...], str]:
     """Return suites and ``tasks`` for LeRobot's settings ``task`` and ``task_ids``, next to ``suite`` and ``tasks``.
 
-    Args:
-        task: suites of LIBERO, separated by commas, or what ``tasks`` accepts.
-        task_ids: LIBERO's ids of tasks, from 0, in each of the suites.
+    ``task`` names suites of LIBERO, separated by commas, or is a value of ``tasks``; ``task_ids`` are LIBERO's, from 0.
 
     Raises:
         MemobenchError: both names of one setting are given, or ids with another suite than LIBERO's.
@@ -223,43 +236,6 @@ def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> 
     return suites, ",".join(map(str, task_ids))
 
 
-def _check_all_alone(entries: list[str]) -> None:
-    """Raise if "all" is combined with other entries."""
-    if len(entries) > 1 and "all" in [entry.strip() for entry in entries]:
-        raise MemobenchError(
-            f"found 'all' with other entries among the tasks, {','.join(entries)!r}; name either 'all' or the others"
-        )
-
-
-def _expand(word: str, suite: str) -> list[str]:
-    """Return the tasks selected by one entry, none for an unknown entry."""
-    if word == "all" or (word in MEMORY_TYPES and suite in SUITES):
-        return task_names(None if word == "all" else word, suite)
-    if word in ALL_SUITES:
-        raise MemobenchError(f"{word!r} is a suite, no task; set suite={word}, or --suite {word}")
-    if NUMERIC_ENTRY.fullmatch(word) is not None:
-        names, numbers = task_names(suite=suite), TASK_NUMBERS.fullmatch(word)
-        lowest = first_number(suite)
-        first, last = (-1, -1) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
-        if not lowest <= first <= last < lowest + len(names):
-            reversed_range = "the range is reversed; " if first > last else ""
-            problem = "this is not a complete range; " if numbers is None else reversed_range
-            raise MemobenchError(
-                f"found {word} among the tasks; {problem}tasks of the {suite} suite are numbered {lowest} to "
-                f"{lowest + len(names) - 1}, an example of a range is 3-7 (`{_listing(suite)}` lists them)"
-            )
-        return names[first - lowest : last - lowest + 1]
-    own = suite_of(word)
-    if own not in (None, suite):
-        raise MemobenchError(f"{word!r} is a task of the {own} suite; set suite={own}, or --suite {own}")
-    return [] if own is None else [word]
-
-
-def _listing(suite: str) -> str:
-    """Return the command that lists the tasks of a suite."""
-    return "memobench tasks" if suite == PUBLISHED else f"memobench tasks --suite {suite}"
-
-
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:
     """Return the entry of ``memobench tasks --json``; ``state_dim`` is 1 + nq + nv of the compiled model."""
     return {
@@ -286,10 +262,8 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
 
 
 def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
-    grouped: dict[str, list[str]] = {}
-    for instance, class_name in instances.items():
-        grouped.setdefault(class_name, []).append(instance)
-    return grouped
+    classes = dict.fromkeys(instances.values())
+    return {each: [instance for instance, name in instances.items() if name == each] for each in classes}
 
 
 # --- task folders ---
@@ -316,31 +290,29 @@ def find_tasks(folder: str | Path) -> list[Path]:
 
 
 def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
-    """Load a task folder.
+    """Load a task folder; without ``require_metadata`` one without a metadata file is a task without checkpoints.
 
     A memory type missing from the metadata is the parent folder's name if it is one of the four. Otherwise it is
     ``procedural`` or ``object`` for an instruction that mentions a prompt or video (``procedural`` if it also mentions
     a procedure, sequence or steps), ``temporal`` if the goal contains a latch, else ``spatial``.
 
-    Args:
-        folder: task folder.
-        require_metadata: False loads a folder without a metadata file as a task without checkpoints.
-
     Raises:
         MemobenchError: with file, place, the value found and the value expected.
     """
     folder = Path(folder).resolve()
-    if folder.parent.parent == LIBERO_FOLDER.resolve():
+    if folder.parent.parent == LIBERO_FOLDER.resolve():  # a place in an archive, see `task_folder`
         return get_libero_task(folder.name)
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
     bddl, path = spelled(folder / BDDL_FILE), spelled(folder / METADATA_FILE)
-    text = read_text(bddl, "the scene, instruction and goal in BDDL")
+    expected = "expected the scene, instruction and goal in BDDL"
+    with refusing(lambda why: MemobenchError(f"{bddl} cannot be read ({why}), {expected}"), bddl):
+        text = bddl.read_text(encoding="utf-8-sig")
     problem = parse_bddl(text, bddl)
-    metadata = Metadata(path, problem, present=require_metadata or path.exists())
+    metadata = Metadata(path if require_metadata or path.exists() else None, problem)
     data, checkpoints = metadata.data, metadata.checkpoints()
     memory_type = data.get("memory_type") or _infer_memory_type(folder, problem)
-    prompt = metadata.prompt(data["prompt"], "prompt") if "prompt" in data else None
+    inferred = "prompt" not in data
     return Task(
         name=folder.name,
         memory_type=memory_type,
@@ -348,7 +320,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         language=problem.language,
         **problem.scene,
         checkpoints=checkpoints,
-        prompt=prompt if "prompt" in data else _infer_prompt(memory_type, problem, checkpoints),
+        prompt=_infer_prompt(memory_type, problem, checkpoints) if inferred else metadata.prompt(data["prompt"]),
         variants=metadata.variants(),
         demo_summary=data.get("demo_summary", ""),
         folder=folder,

@@ -10,29 +10,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.formula import Atom, Formula, atoms
 from lerobot_memobench.tasks.progress import Evaluator
-from lerobot_memobench.tasks.task import REFERENTS, Task
+from lerobot_memobench.tasks.task import Task
 
 
 def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
     """Return scene index (from 0) and variant of an episode; consecutive episodes cycle through a scene's variants."""
     choices = task.random_variants
     return episode // len(choices), choices[episode % len(choices)]
-
-
-def check_referent(referent: str) -> None:
-    """Check that evidence episodes may use all variants.
-
-    Raises:
-        MemobenchError: ``referent`` allows the published variant only.
-    """
-    if referent == REFERENTS[0]:
-        raise MemobenchError(
-            f"evidence=true runs each scene with each variant, but referent={referent} allows the published variant "
-            f"only; set referent={REFERENTS[1]}"
-        )
 
 
 def chance(task: Task) -> float | None:
@@ -57,11 +43,8 @@ class Choice:
 
     The sequence of lifted objects and moved joints decides. If it fits the goal of one variant only, that variant is
     chosen; if it fits none, the answer is wrong. If goals handle the same objects in the same order (one object,
-    several places), the first goal to become true is chosen, or the only one that is still reachable.
-
-    Args:
-        task: variant that is run. Candidates are the variants with its instruction, or all variants if the
-            instruction determines the goal (for example a count).
+    several places), the first goal to become true is chosen, or the only one that is still reachable. Candidates are
+    the variants with the instruction of ``task``, or all variants if the instruction determines the goal (a count).
     """
 
     def __init__(self, task: Task) -> None:

@@ -6,9 +6,9 @@ prompt's, and a horizon below the protocol's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
-from lerobot_memobench.tasks.formula import Formula, Never, Round, Then, When, atoms, children
+from lerobot_memobench.tasks.formula import Formula, Never, Round, Then, When, atoms, walk
 from lerobot_memobench.tasks.task import HAND, MISCOUNT, STRICT, Task
 
 REFERENCE_DRIFT = "reference_drift"
@@ -49,11 +49,9 @@ def classify_failure(
 
     Args:
         first_steps: (K,) first execution step at which each checkpoint's predicate held; None for never.
-        success: whether the goal held at the end.
         drift: whether a wrong answer was given (object and procedural tasks).
-        lost: the part of the goal that made it unreachable (strict tasks), see `Progress.broken`.
+        lost, ordered: `Progress.broken` and `Progress.ordered` of strict tasks.
         cut_off: whether a horizon below the protocol's ended the episode.
-        ordered: see `Progress.ordered`.
     """
     if lost and (spoilt := _spoilt(task, first_steps, lost)) is not None:
         return spoilt
@@ -76,11 +74,11 @@ def _spoilt(task: Task, first_steps: Sequence[int | None], lost: Formula) -> str
     if not isinstance(lost, When):
         return MISCOUNT
     # The earlier event was complete, and only the hand's return was missing.
-    before = [part for part in _parts(lost) if isinstance(part, Round)]
+    before = [part for part in walk(lost) if isinstance(part, Round)]
     complete = [
         step is not None and any(isinstance(part, Round) and part.children == each.children[:-1] for each in before)
         for checkpoint, step in zip(task.checkpoints, first_steps, strict=True)
-        for part in _parts(checkpoint.goal)
+        for part in walk(checkpoint.goal)
     ]
     return HAND if any(complete) else WRONG_ORDER
 
@@ -112,24 +110,11 @@ def classify(
 
 
 def asks_order(goal: Formula) -> bool:
-    """Return whether a goal requires an order of its parts."""
-    return any(isinstance(part, Then | When | Round) for part in _parts(goal))
-
-
-def _parts(formula: Formula) -> Iterator[Formula]:
-    yield formula
-    for child in children(formula):
-        yield from _parts(child)
+    """Return whether a goal asks for an order of its parts."""
+    return any(isinstance(part, Then | When | Round) for part in walk(goal))
 
 
 def _out_of_order(first_steps: Sequence[int | None]) -> bool:
     """Return whether a checkpoint was satisfied before, or without, an earlier one."""
-    earlier_missing, latest = False, 0
-    for step in first_steps:
-        if step is None:
-            earlier_missing = True
-            continue
-        if earlier_missing or step < latest:
-            return True
-        latest = step
-    return False
+    reached = [step for step in first_steps if step is not None]
+    return reached != sorted(reached) or None in first_steps[: len(reached)]

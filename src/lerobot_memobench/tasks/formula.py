@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import short
 
 #: Predicate (lower case) -> (spelling in BDDL, number of arguments).
 PREDICATES: dict[str, tuple[str, int]] = {
@@ -126,16 +127,6 @@ _OPERATORS = (And, Or, Not, Then, Never, Hold, Exactly, When, Round)
 OPERATORS: dict[str, type[Formula]] = {made.__name__.lower(): made for made in _OPERATORS}
 
 
-def is_operator(word: str) -> bool:
-    """Return whether ``word`` names an operator, ignoring case."""
-    return word.lower() in OPERATORS
-
-
-def takes_number(word: str) -> bool:
-    """Return whether ``word`` names an operator with a number before its formula, such as ``Exactly 2``."""
-    return word.lower() in ("hold", "exactly")
-
-
 # --- walking ---
 
 
@@ -146,12 +137,16 @@ def children(formula: Formula) -> tuple[Formula, ...]:
     return (formula.child,) if isinstance(formula, Not | Never | Hold | Exactly) else formula.children
 
 
+def walk(formula: Formula) -> Iterator[Formula]:
+    """Yield ``formula`` and its descendants, parents first, from left to right."""
+    yield formula
+    for child in children(formula):
+        yield from walk(child)
+
+
 def atoms(formula: Formula) -> Iterator[Atom]:
     """Yield the atoms of ``formula`` from left to right, including repetitions."""
-    if isinstance(formula, Atom):
-        yield formula
-    for child in children(formula):
-        yield from atoms(child)
+    return (part for part in walk(formula) if isinstance(part, Atom))
 
 
 def rename(formula: Formula, names: Mapping[str, str]) -> Formula:
@@ -189,7 +184,7 @@ _PARTS: dict[type[Formula], int] = {Not: 1, Never: 1, Hold: 1, Exactly: 1, When:
 _WORDS = {1: "exactly one", 2: "exactly two"}
 
 
-def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> Atom:
+def make_atom(predicate: str, args: Sequence[str], where: str) -> Atom:
     """Return a checked atom; ``where`` (file and line) is the prefix of error messages."""
     key = predicate.lower()
     if key not in PREDICATES:
@@ -205,30 +200,23 @@ def make_atom(predicate: str, args: Sequence[str], where: str = "formula") -> At
     return Atom(key, tuple(args))
 
 
-def make_operator(
-    operator: str, parts: Sequence[Formula], where: str = "formula", number: int | str | None = None
-) -> Formula:
-    """Return a checked operator of `OPERATORS` (case-insensitive); `Hold` and `Exactly` need a number from 1."""
-    made = OPERATORS[operator.lower()]
-    counted = [_checked_number(number, made.__name__, where)] if takes_number(operator) else []
+def make_operator(operator: type[Formula], parts: Sequence[Formula], where: str, number: Any = None) -> Formula:
+    """Return a checked operator; `Hold` and `Exactly` need a number from 1."""
+    name = operator.__name__
+    if issubclass(operator, Counted):
+        expected = f"expected a whole number from 1 to {MAX_NUMBER}"
+        if number is None:
+            raise MemobenchError(f"{where}: found {name} without a number, {expected} before a formula")
+        if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_NUMBER:
+            raise MemobenchError(f"{where}: found {number!r} after {name}, {expected}")
     if not parts:
-        raise MemobenchError(f"{where}: found {made.__name__} without a formula, expected at least one")
-    if len(parts) != _PARTS.get(made, len(parts)):
-        raise MemobenchError(
-            f"{where}: found {made.__name__} over {len(parts)} formulas, expected {_WORDS[_PARTS[made]]}"
-        )
-    make: Callable[..., Formula] = made
-    return make(*counted, tuple(parts) if made not in _PARTS or made is When else parts[0])
-
-
-def _checked_number(number: Any, after: str, where: str) -> int:
-    if number is None:
-        raise MemobenchError(
-            f"{where}: found {after} without a number, expected a whole number from 1 to {MAX_NUMBER} before a formula"
-        )
-    if not isinstance(number, int) or isinstance(number, bool) or not 1 <= number <= MAX_NUMBER:
-        raise MemobenchError(f"{where}: found {number!r} after {after}, expected a whole number from 1 to {MAX_NUMBER}")
-    return number
+        raise MemobenchError(f"{where}: found {name} without a formula, expected at least one")
+    if len(parts) != _PARTS.get(operator, len(parts)):
+        raise MemobenchError(f"{where}: found {name} over {len(parts)} formulas, expected {_WORDS[_PARTS[operator]]}")
+    make: Callable[..., Formula] = operator
+    if issubclass(operator, Counted):
+        return make(number, parts[0])
+    return make(parts[0] if _PARTS.get(operator) == 1 else tuple(parts))
 
 
 # --- reading JSON formulas of metadata files: nested lists, objects, or both ---
@@ -243,13 +231,8 @@ def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula
     may be mixed, and an operator may hold a bare atom instead of a list. A number precedes the formula:
     ``["exactly", 2, ["open", "a"]]``, ``{"exactly": [2, ["open", "a"]]}``.
 
-    Args:
-        value: lists and objects as read from JSON.
-        where: prefix of error messages.
-        depth: nesting depth within the outermost formula.
-
     Raises:
-        MemobenchError: ``value`` is not a formula.
+        MemobenchError: ``value`` is not a formula; the message begins with ``where``.
     """
     if depth > MAX_DEPTH:
         raise MemobenchError(f"{where}: found a formula nested deeper than {MAX_DEPTH} levels, expected a flatter one")
@@ -258,16 +241,14 @@ def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula
     elif isinstance(value, (list, tuple)) and value and isinstance(value[0], str):
         head, items = value[0], value[1:]
     else:
-        raise MemobenchError(f"{where}: found {short_repr(value)}, expected a formula such as ['on', 'a', 'b']")
-    if is_operator(head):
-        numbered = takes_number(head) and items and not isinstance(items[0], (list, tuple, Mapping))
+        raise MemobenchError(f"{where}: found {short(value)}, expected a formula such as ['on', 'a', 'b']")
+    if (operator := OPERATORS.get(head.lower())) is not None:
+        numbered = issubclass(operator, Counted) and items and not isinstance(items[0], (list, tuple, Mapping))
         number, parts = (items[0], items[1:]) if numbered else (None, items)
-        return make_operator(head, [parse_formula(item, where, depth + 1) for item in parts], where, number)
+        return make_operator(operator, [parse_formula(item, where, depth + 1) for item in parts], where, number)
     for item in items:
         if not isinstance(item, str) or not item:
-            raise MemobenchError(
-                f"{where}: found {short_repr(item)} as an argument of {head!r}, expected an entity name"
-            )
+            raise MemobenchError(f"{where}: found {short(item)} as an argument of {head!r}, expected an entity name")
     return make_atom(head, items, where)
 
 
@@ -276,17 +257,11 @@ def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[An
     if len(value) != 1:
         raise MemobenchError(f"{where}: found an object with {len(value)} keys, expected one of {_KEYS}")
     ((head, rest),) = value.items()
-    if not isinstance(head, str) or not is_operator(head):
+    if not isinstance(head, str) or head.lower() not in OPERATORS:
         raise MemobenchError(f"{where}: found the key {head!r}, expected one of {_KEYS}")
     # {"not": ["on", "a", "b"]} and {"not": {"and": ...}} hold one formula, not a list of them.
     bare = isinstance(rest, Mapping) or (isinstance(rest, (list, tuple)) and rest and isinstance(rest[0], str))
     items = [rest] if bare else rest
     if not isinstance(items, (list, tuple)):
-        raise MemobenchError(f"{where}: found {short_repr(rest)} under {head!r}, expected a list of formulas")
+        raise MemobenchError(f"{where}: found {short(rest)} under {head!r}, expected a list of formulas")
     return head, items
-
-
-def short_repr(value: Any) -> str:
-    """Return the ``repr`` of a value for messages, at most 40 characters."""
-    text = repr(value)
-    return text if len(text) <= 40 else text[:37] + "..."

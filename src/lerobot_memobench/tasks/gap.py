@@ -16,10 +16,7 @@ GAPS_FILE = Path(__file__).with_name("gaps.json")
 
 
 class Gap(NamedTuple):
-    """Gap of a checkpoint in control steps over the expert's episodes, without holds.
-
-    ``held``: whether the first hold of the execution lies between cue and use.
-    """
+    """Control steps over the expert's episodes, without holds; ``held``: the first hold lies between cue and use."""
 
     least: int
     median: int

@@ -36,24 +36,14 @@ STEP_LIMITS: dict[LiberoSuite, int] = {
 
 
 def libero_tasks(suite: str) -> tuple[str, ...]:
-    """Return the names of a suite's tasks in LIBERO's order: a task's id is its index.
-
-    Raises:
-        MemobenchError: the suite is unknown, or its file is damaged.
-    """
+    """Return the names of a suite's tasks in LIBERO's order, a task's id is its index; raises for an unknown suite."""
     check_choice("suite", suite, LIBERO_SUITES)
-    return _names(next(known for known in LIBERO_SUITES if known == suite))
-
-
-def libero_suite_of(name: str) -> LiberoSuite | None:
-    """Return the LIBERO suite of a task, None for an unknown name; names are unique over all suites."""
-    return next((suite for suite in LIBERO_SUITES if name in _names(suite)), None)
+    return _names(suite)
 
 
 def libero_id(name: str) -> int | None:
     """Return LIBERO's id of a task, its index in its suite; None for a task that is not LIBERO's."""
-    suite = libero_suite_of(name)
-    return None if suite is None else _names(suite).index(name)
+    return next((_names(suite).index(name) for suite in LIBERO_SUITES if name in _names(suite)), None)
 
 
 @cache
@@ -61,11 +51,8 @@ def get_libero_task(name: str) -> Task:
     """Return a LIBERO task.
 
     Its instruction is LIBERO's and LeRobot's, derived from the task's name; the file's ``:language`` may differ.
-
-    Raises:
-        MemobenchError: the name is unknown, or the suite's file is damaged.
     """
-    suite = _checked_suite(name)
+    suite = _suite_of(name)
     text = _read(suite, f"{name}.bddl").decode()
     problem = parse_bddl(text, f"{_archive(suite)}/{name}.bddl")
     return Task(
@@ -92,7 +79,7 @@ def initial_states(name: str) -> NDArray[np.float64]:
     Raises:
         MemobenchError: the name is unknown, or the suite's file is damaged.
     """
-    suite = _checked_suite(name)
+    suite = _suite_of(name)
     with refusing(lambda reason: _damaged(suite, reason)):
         states = np.load(io.BytesIO(_read(suite, f"{name}.npy")), allow_pickle=False)
         if states.dtype != np.float64 or states.ndim != 2 or len(states) != NUM_STATES or not np.isfinite(states).all():
@@ -117,28 +104,28 @@ def language(name: str) -> str:
     return " ".join(words[scenes[0] + 1 :] if name[0].isupper() and scenes else words)
 
 
-def _checked_suite(name: str) -> LiberoSuite:
-    suite = libero_suite_of(name)
-    if suite is None:
-        known = [known for each in LIBERO_SUITES for known in _names(each)]
-        raise MemobenchError(f"found no task named {name!r} in LIBERO's suites, {nearest(name, known)}")
-    return suite
+def _suite_of(name: str) -> LiberoSuite:
+    for suite in LIBERO_SUITES:  # names are unique over all suites
+        if name in _names(suite):
+            return suite
+    known = [known for suite in LIBERO_SUITES for known in _names(suite)]
+    raise MemobenchError(f"found no task named {name!r} in LIBERO's suites, {nearest(name, known)}")
 
 
 @cache
-def _names(suite: LiberoSuite) -> tuple[str, ...]:
+def _names(suite: str) -> tuple[str, ...]:
     with refusing(lambda reason: _damaged(suite, reason)), zipfile.ZipFile(_archive(suite)) as archive:
         return tuple(entry.removesuffix(".bddl") for entry in archive.namelist() if entry.endswith(".bddl"))
 
 
-def _read(suite: LiberoSuite, entry: str) -> bytes:
+def _read(suite: str, entry: str) -> bytes:
     with refusing(lambda reason: _damaged(suite, reason)), zipfile.ZipFile(_archive(suite)) as archive:
         return archive.read(entry)
 
 
-def _archive(suite: LiberoSuite) -> Path:
+def _archive(suite: str) -> Path:
     return FOLDER / f"{suite}.zip"
 
 
-def _damaged(suite: LiberoSuite, reason: str) -> MemobenchError:
+def _damaged(suite: str, reason: str) -> MemobenchError:
     return MemobenchError(f"{_archive(suite)} is not the file of this package ({reason}); install the package again")

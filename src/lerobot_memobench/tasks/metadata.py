@@ -15,9 +15,19 @@ from annotated_types import Ge, Le, Len, MinLen
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import read_json, short
 from lerobot_memobench.tasks.bddl import Problem
-from lerobot_memobench.tasks.difficulty import EASY, Difficulty
 from lerobot_memobench.tasks.formula import Formula, parse_formula, rename
-from lerobot_memobench.tasks.task import OPERATIONS, Checkpoint, MemoryType, Prompt, PromptKind, Suite, Texts, Variant
+from lerobot_memobench.tasks.task import (
+    EASY,
+    OPERATIONS,
+    Checkpoint,
+    Difficulty,
+    MemoryType,
+    Prompt,
+    PromptKind,
+    Suite,
+    Texts,
+    Variant,
+)
 
 LevelTexts = Annotated[list[str], Len(3, 3)]
 LevelLabels = Annotated[list[Annotated[int, Ge(0), Le(2)]], Len(3, 3)]
@@ -28,13 +38,7 @@ ADVICE = (
 
 
 class PromptData(TypedDict):
-    """A demonstration prompt.
-
-    Attributes:
-        kind: routine, pick, point, highlight or hide.
-        target: declared object; required for pick, point and highlight.
-        places: pairs of object and drawer; required for hide.
-    """
+    """A demonstration prompt: ``target`` for pick, point and highlight, pairs of object and drawer for hide."""
 
     kind: PromptKind
     target: NotRequired[str | None]
@@ -42,12 +46,7 @@ class PromptData(TypedDict):
 
 
 class VariantData(TypedDict):
-    """A variant of the task; see `task.Variant`.
-
-    Attributes:
-        memory: K lists of three texts.
-        subtask_goals: K formulas.
-    """
+    """A variant of the task, see `task.Variant`: K lists of three texts, K formulas."""
 
     memory: list[LevelTexts]
     substitute: NotRequired[dict[str, str]]
@@ -89,21 +88,20 @@ class MetadataFile(TypedDict):
 
 
 class Metadata:
-    """Parsed content of a metadata file; its methods raise `MemobenchError` with file and key.
+    """Content of a metadata file; its methods raise `MemobenchError` with file and key.
 
     Args:
-        path: path of the file.
+        path: path of the file; None for a task without metadata, which has no checkpoints.
         problem: BDDL problem of the same folder, which declares the names.
-        present: False for a task without metadata file, which has no checkpoints.
 
     Attributes:
         data: content of the file, a `MetadataFile` or {}.
     """
 
-    def __init__(self, path: Path, problem: Problem, present: bool = True) -> None:
+    def __init__(self, path: Path | None, problem: Problem) -> None:
         self.path, self.problem = path, problem
         self.data: dict[str, Any] = {}
-        if present:
+        if path is not None:
             try:
                 self.data = read_json(path, MetadataFile, ADVICE)
             except FileNotFoundError:
@@ -113,19 +111,20 @@ class Metadata:
         return MemobenchError(f"{self.path}: found {key} = {short(found)}, expected {expected}")
 
     def _check_count(self, key: str, values: list[Any]) -> None:
-        """Check that a list has one entry per checkpoint."""
         count = len(self.data["subtask_goals"])
         if len(values) != count:
             raise self._error(key, values, f"a list of {count} entries, one per subtask goal")
 
     def _check_keys(self, key: str, value: Mapping[str, Any], kind: type) -> None:
-        """Check that an object contains no unknown key."""
         known = kind.__annotations__
         for name in value:
             if name not in known:
                 raise self._error(key, value, f"only the keys {', '.join(known)}; {nearest(name, known)}")
 
-    # --- checkpoints ---
+    def _check_name(self, name: str, key: str) -> None:
+        if name not in self.problem.names:
+            hint = nearest(name, self.problem.names)
+            raise self._error(key, name, f"a name that the BDDL file declares, {hint}")
 
     def checkpoints(self) -> tuple[Checkpoint, ...]:
         """Return the checkpoints; empty without a file."""
@@ -154,9 +153,7 @@ class Metadata:
     def _formulas(self, values: list[Any], key: str) -> tuple[Formula, ...]:
         return tuple(self._formula(value, f"{key}[{k}]") for k, value in enumerate(values))
 
-    # --- prompt ---
-
-    def prompt(self, value: PromptData | None, key: str) -> Prompt | None:
+    def prompt(self, value: PromptData | None, key: str = "prompt") -> Prompt | None:
         """Return a demonstration prompt; None for null."""
         if value is None:
             return None
@@ -172,13 +169,6 @@ class Metadata:
         if target is not None:
             self._check_name(target, f"{key}.target")
         return Prompt(kind, target, tuple((thing, drawer) for thing, drawer in places))
-
-    def _check_name(self, name: str, key: str) -> None:
-        if self.problem.entity_kind(name) is None:
-            known = [*self.problem.objects, *self.problem.fixtures, *self.problem.regions]
-            raise self._error(key, name, f"a name that the BDDL file declares, {nearest(name, known)}")
-
-    # --- variants ---
 
     def variants(self) -> tuple[Variant, ...]:
         """Return the variants."""
@@ -214,17 +204,3 @@ class Metadata:
         for k, goal in enumerate((self.problem.goal, *checkpoints)):
             which = "goal" if k == 0 else f"checkpoint {k - 1}"
             self.problem.resolve(rename(goal, substitute), f"{self.path}, {key} ({which})")
-
-
-def read_text(path: Path, holds: str) -> str:
-    """Return a file's text; ``holds`` describes the expected content in error messages."""
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise MemobenchError(f"{path} is missing, expected a file that holds {holds}") from None
-    except UnicodeDecodeError as error:
-        raise MemobenchError(
-            f"{path}: found a byte at offset {error.start} that is not UTF-8, expected UTF-8 text"
-        ) from None
-    except OSError as error:
-        raise MemobenchError(f"{path} cannot be read ({error.strerror}), expected a file that holds {holds}") from None

@@ -29,7 +29,7 @@ Read = Callable[[Atom], bool]
 """Returns the value of an atom in the present step, including latched atoms."""
 
 
-def build(formula: Formula, hold_steps: int) -> Node:
+def build(formula: Formula, hold_steps: int) -> _Node:
     """Return the evaluation tree of a formula; ``hold_steps``: steps for which each child of `Then` has to hold."""
     if isinstance(formula, Atom):
         return _AtomNode(formula)
@@ -38,22 +38,20 @@ def build(formula: Formula, hold_steps: int) -> Node:
     return _NODES[type(formula)](parts, number)
 
 
-class Node:
-    """Evaluation state of one node of a formula's tree.
+class _Node:
+    """State of one node of a formula's tree.
 
-    Args:
-        parts: nodes of the formula's children.
+    Attributes:
+        remembers: names of the attributes that change; the class attributes of these names are the initial values.
         number: number of `Hold` and `Exactly`; for `Then` the steps for which a child has to hold.
     """
 
     remembers: ClassVar[tuple[str, ...]] = ()
-    """Names of the state attributes; the class attributes of these names are the initial values."""
 
-    def __init__(self, parts: Sequence[Node] = (), number: int = 0) -> None:
+    def __init__(self, parts: Sequence[_Node] = (), number: int = 0) -> None:
         self.parts, self.number = parts, number
 
     def reset(self) -> None:
-        """Forget earlier steps."""
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
         for part in self.parts:
@@ -61,36 +59,33 @@ class Node:
 
     @property
     def memory(self) -> tuple[int, ...]:
-        """State of this node (not its children) that affects later values; -1 for undecided."""
+        """State of this node, not of its children; -1 for undecided."""
         values = [getattr(self, name) for name in self.remembers]
         return tuple(-1 if value is None else int(value) for value in values)
 
     def value(self, read: Read) -> bool:
-        """Advance one step and return the value; ``read`` evaluates atoms."""
+        """Advance one step and return the value."""
         raise NotImplementedError
 
     @property
     def settled(self) -> bool | None:
-        """Value of the node at all later steps, whatever happens; None while undecided.
-
-        Sound but not complete: a decided value may be reported late.
-        """
+        """Value at all later steps, None while undecided. Sound, not complete: it may be reported late."""
         raise NotImplementedError
 
-    def walk(self) -> Iterator[Node]:
-        """Yield this node and its descendants."""
+    def walk(self) -> Iterator[_Node]:
         yield self
         for part in self.parts:
             yield from part.walk()
 
 
-class _AtomNode(Node):
+class _AtomNode(_Node):
     """Present value of an atom; a latched atom settles once it is set."""
+
+    latched = False
 
     def __init__(self, atom: Atom) -> None:
         super().__init__()
         self.atom = atom
-        self.latched = False
 
     def reset(self) -> None:
         self.latched = False
@@ -108,9 +103,7 @@ class _AtomNode(Node):
 # --- And, Or, Not: stateless. Every part is evaluated in every step because a nested operator must see each step ---
 
 
-class _AndNode(Node):
-    """True when all parts are true."""
-
+class _AndNode(_Node):
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
         return all(values)
@@ -121,9 +114,7 @@ class _AndNode(Node):
         return False if False in found else None if None in found else True
 
 
-class _OrNode(Node):
-    """True when any part is true."""
-
+class _OrNode(_Node):
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
         return any(values)
@@ -134,9 +125,7 @@ class _OrNode(Node):
         return True if True in found else None if None in found else False
 
 
-class _NotNode(Node):
-    """True when the part is false."""
-
+class _NotNode(_Node):
     def value(self, read: Read) -> bool:
         return not self.parts[0].value(read)
 
@@ -149,9 +138,7 @@ class _NotNode(Node):
 # --- Never, Hold, Exactly: durations and counts ---
 
 
-class _NeverNode(Node):
-    """True until the part has been true."""
-
+class _NeverNode(_Node):
     remembers = ("broken",)
     broken = False
 
@@ -165,9 +152,7 @@ class _NeverNode(Node):
         return False if self.broken else True if self.parts[0].settled is False else None
 
 
-class _HoldNode(Node):
-    """True when the part has been true for the last ``number`` steps."""
-
+class _HoldNode(_Node):
     remembers = ("held",)
     held = 0
 
@@ -181,7 +166,7 @@ class _HoldNode(Node):
         return None if found and self.held < self.number else found
 
 
-class _ExactlyNode(Node):
+class _ExactlyNode(_Node):
     """True while the part has had ``number`` rising edges; the count saturates at one more."""
 
     remembers = ("count", "before")
@@ -204,7 +189,7 @@ class _ExactlyNode(Node):
 # --- Then, Round, When: order of events ---
 
 
-class _ThenNode(Node):
+class _ThenNode(_Node):
     """Count how long the current child has held; evaluate the next child from the following step."""
 
     remembers = ("done", "held")
@@ -224,7 +209,7 @@ class _ThenNode(Node):
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
 
-class _RoundNode(Node):
+class _RoundNode(_Node):
     """Evaluate the next part from the following step; reset all parts after a complete round."""
 
     remembers = ("done",)
@@ -242,7 +227,7 @@ class _RoundNode(Node):
         return False if any(part.settled is False for part in self.parts[self.done :]) else None
 
 
-class _WhenNode(Node):
+class _WhenNode(_Node):
     """Latch the second part's value in the first step in which the first part is true."""
 
     remembers = ("decided",)
@@ -261,7 +246,7 @@ class _WhenNode(Node):
         return False if any(part.settled is False for part in self.parts) else None
 
 
-_NODES: dict[type[Formula], type[Node]] = {
+_NODES: dict[type[Formula], type[_Node]] = {
     And: _AndNode,
     Or: _OrNode,
     Not: _NotNode,

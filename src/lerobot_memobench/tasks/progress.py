@@ -6,9 +6,9 @@ Semantics: the benchmark's task files (BDDL goals and metadata goals), paper sec
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 
-from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Round, When, atoms, children
+from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Round, When, atoms, children, walk
 from lerobot_memobench.tasks.nodes import build
 from lerobot_memobench.tasks.task import Task
 
@@ -21,19 +21,17 @@ AS_BEGUN = Atom("asbegun", ())
 class Evaluator:
     """Evaluate several formulas once per control step and keep their state.
 
-    - ``holds`` is called at most once per distinct atom and step, and never for a latched predicate.
-    - Latches of all formulas are updated first, whether or not their formula evaluates them; ``reset`` clears them.
-    - A child of ``Then`` is done after it has held for ``hold_steps`` consecutive steps. The following child is
-      evaluated from the next step. Done children stay done. ``Then`` is true when its last child is done. A nested
-      ``Then`` must itself be true for ``hold_steps`` steps.
+    Latches of all formulas are updated first, whether or not their formula evaluates them. A child of ``Then`` is done
+    after it has held for ``hold_steps`` consecutive steps, and stays done. The following child is evaluated from the
+    next step. ``Then`` is true when its last child is done; a nested one must itself be true for ``hold_steps`` steps.
     """
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
         self.formulas = tuple(formulas)
         self._nodes = [build(formula, hold_steps) for formula in self.formulas]
         self._remembering = [node for root in self._nodes for node in root.walk() if node.memory]
-        found = {atom for formula in self.formulas for atom in atoms(formula) if atom.predicate in LATCHES}
-        self._sources = {atom: Atom(LATCHES[atom.predicate], atom.args) for atom in sorted(found, key=str)}
+        latches = {atom for formula in self.formulas for atom in atoms(formula) if atom.predicate in LATCHES}
+        self._sources = {atom: Atom(LATCHES[atom.predicate], atom.args) for atom in sorted(latches, key=str)}
         self._latched: set[Atom] = set()
 
     def reset(self) -> None:
@@ -65,7 +63,10 @@ class Evaluator:
         return [(part, each.settled) for part, each in zip(children(formula), node.parts, strict=True)]
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
-        """Evaluate one control step and return the value of each formula; ``holds`` evaluates atoms."""
+        """Evaluate one control step and return the value of each formula.
+
+        ``holds`` is called at most once per distinct atom, and never for a latched predicate.
+        """
         memo: dict[Atom, bool] = {}
 
         def world(atom: Atom) -> bool:
@@ -86,9 +87,7 @@ class Evaluator:
 class Progress:
     """Track the execution phase of one episode; call ``step`` exactly once per control step.
 
-    Args:
-        task: task with goal and checkpoints.
-        evaluations: evaluations per control step; with two, each part of `Then` has to hold for five steps.
+    With two ``evaluations`` per control step, each part of `Then` has to hold for five steps.
 
     Attributes (steps count from 1, None before the event; K checkpoints):
         steps: control steps taken since ``reset``.
@@ -104,12 +103,14 @@ class Progress:
     def __init__(self, task: Task, evaluations: int = 1) -> None:
         self.task, self._evaluations = task, evaluations
         goals = [task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)]
-        events = {event for k in range(task.num_variants) for event in _events(task.variant(k).goal)}
+        parts = {part for k in range(task.num_variants) for part in walk(task.variant(k).goal)}
+        # Rounds that begin in any scene; those with `AS_BEGUN` begin in the scene of the start only.
+        events = [part for part in parts if isinstance(part, Round) and AS_BEGUN not in part.children]
         self._evaluator = Evaluator([*goals, *events])
         self.reset()
 
     def reset(self) -> None:
-        """Restart the execution: clear all state."""
+        """Restart the execution: clear all node."""
         self._evaluator.reset()
         count = len(self.task.checkpoints)
         self.steps = 0
@@ -154,11 +155,3 @@ class Progress:
             self.ordered_step[self.index] = self.steps
             self.index += 1
         return self.success
-
-
-def _events(formula: Formula) -> Iterator[Round]:
-    """Yield the rounds of a goal that may begin in any scene."""
-    if isinstance(formula, Round) and AS_BEGUN not in formula.children:
-        yield formula
-    for child in children(formula):
-        yield from _events(child)

@@ -9,11 +9,11 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.bddl import Region
-from lerobot_memobench.tasks.difficulty import EASY, STANDARD, Difficulty, draws
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 
 MemoryType = Literal["temporal", "spatial", "object", "procedural"]
@@ -21,6 +21,7 @@ Operation = Literal["S", "U", "C"]
 PromptKind = Literal["routine", "pick", "point", "highlight", "hide"]
 Suite = Literal["published", "strict"]
 LiberoSuite = Literal["libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90"]
+Difficulty = Literal["easy", "standard", "hard", "extreme"]
 Texts = tuple[str, str, str]
 
 MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
@@ -29,6 +30,11 @@ SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
 #: LIBERO's own suites (`tasks.libero_suites`), whose tasks have no checkpoints.
 LIBERO_SUITES: tuple[LiberoSuite, ...] = get_args(LiberoSuite)
+#: Difficulty of strict tasks -> largest number of repetitions that a counting task asks for. Each one draws from the
+#: variants of the easier ones and its own (`Variant.difficulty`).
+REPETITIONS: dict[Difficulty, int] = {"easy": 2, "standard": 3, "hard": 5, "extreme": 8}
+DIFFICULTIES = tuple(REPETITIONS)
+EASY, STANDARD = DIFFICULTIES[:2]
 REFERENTS = ("fixed", "random")
 #: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
 DRAWN = "drawn"
@@ -51,15 +57,18 @@ def referent_text(requested: str, drawn: bool) -> str:
     return DRAWN if drawn else requested
 
 
+def horizon_of(difficulty: str) -> int:
+    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown.
+
+    As many per repetition as in the standard suite, and not less in all.
+    """
+    check_choice("difficulty", difficulty, DIFFICULTIES)
+    return max(HORIZON, HORIZON * REPETITIONS[cast("Difficulty", difficulty)] // REPETITIONS[STANDARD])
+
+
 @dataclass(frozen=True)
 class Checkpoint:
-    """A memory checkpoint.
-
-    Attributes:
-        goal: predicate that detects the event.
-        operations_by_level: labels at the coarse, intermediate and fine level.
-        language: reference memory texts after the event, at the three levels.
-    """
+    """A memory checkpoint: the goal detects the event; labels and texts at the coarse, intermediate and fine level."""
 
     goal: Formula
     operations_by_level: tuple[Operation, Operation, Operation]
@@ -98,11 +107,8 @@ class Variant:
         substitute: simultaneous replacement of names in goal, checkpoint goals and prompt target.
         order: index of the published checkpoint at each position; operation labels keep their positions.
         languages: texts per position (coarse, intermediate, fine).
-        goals: checkpoint goals per position; override substituted and reordered goals.
-        goal: goal; overrides the substituted goal.
-        demo_summary: description of the demonstration.
-        language: instruction; overrides the task's.
-        prompt: demonstration prompt; overrides the substituted prompt.
+        goals, goal: checkpoint goals per position, and goal; override substituted and reordered ones.
+        language, prompt: override the task's instruction and the substituted prompt.
         replaces_published: whether the published goal is looser (accepts another order); then variant 0 is not drawn.
         difficulty: lowest difficulty at which it is drawn.
     """
@@ -124,20 +130,16 @@ class Task:
     """All data of a task. Do not modify its dicts.
 
     Attributes:
-        name: name of the folder.
         memory_type: temporal, spatial, object or procedural; the suite for a task of LIBERO's suites, which LeRobot
             reports by suite.
         family: group of similar tasks.
-        language: instruction.
         objects: instance -> class, in the file's order.
         fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: initial state; objects in regions are sampled, others rest on their support.
-        prompt: demonstration prompt; None for the published temporal and spatial tasks.
+        prompt: None for the published temporal and spatial tasks.
         variants: alternatives to the published task: ``variant(k)`` for k >= 1.
-        variant_index: index of this variant.
-        bddl_text: content of the task file.
-        metadata: content of the metadata file.
+        bddl_text, metadata: content of the task's files.
         suite: published, strict or one of LIBERO's; a strict episode ends when its goal can no longer be reached.
         derived_from: published task with the same scene; None for a task with its own scene.
         drawn: whether each episode draws its variant by seed and ignores the referent setting; False for a variant.
@@ -181,9 +183,9 @@ class Task:
     def __hash__(self) -> int:
         return hash((self.name, self.bddl_text, self.variant_index))
 
-    def at(self, difficulty: Difficulty) -> Task:
+    def at(self, difficulty: str) -> Task:
         """Return the task with the variants of another difficulty (strict tasks only)."""
-        return dataclasses.replace(self, difficulty=difficulty)
+        return dataclasses.replace(self, difficulty=cast("Difficulty", difficulty))
 
     @property
     def title(self) -> str:
@@ -213,9 +215,9 @@ class Task:
     @property
     def random_variants(self) -> tuple[int, ...]:
         """Indices drawn for a random referent: those of the difficulty, without 0 if a stricter variant replaces it."""
-        first = 1 if any(variant.replaces_published for variant in self.variants) else 0
-        harder = {k for k, one in enumerate(self.variants, 1) if not draws(self.difficulty, one.difficulty)}
-        return tuple(k for k in range(first, self.num_variants) if k not in harder)
+        first = () if any(variant.replaces_published for variant in self.variants) else (0,)
+        drawn = DIFFICULTIES[: DIFFICULTIES.index(self.difficulty) + 1]
+        return *first, *(k for k, variant in enumerate(self.variants, 1) if variant.difficulty in drawn)
 
     def variant(self, k: int) -> Task:
         """Return the task with instruction, goal, checkpoints, texts and prompt of variant ``k``; 0 is published."""

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from safetensors import safe_open
@@ -22,26 +22,14 @@ logger = logging.getLogger(__name__)
 TRAINING_FILE = "training_weights.safetensors"
 
 
-class Averaged(NamedTuple):
-    """State of one parameter in a checkpoint.
-
-    Attributes:
-        weights: trained weights. average: their average, None if the model's file holds it exactly.
-        updates: number of updates in the average.
-    """
-
-    weights: Tensor
-    average: Tensor | None
-    updates: int
-
-
 class WeightAverage:
     """Trained weights, their average and the number of averaged updates, for each parameter.
 
-    The average is kept outside the module, so that optimiser, DDP and ``state_dict`` do not see it. Its decay grows
-    from 0.1 to the given value as (1 + n) / (10 + n) over the first updates n of a parameter, so that the average of a
-    short run is not dominated by the initial weights; after 9,000 updates it is 0.999. Averages are always float32,
-    because bfloat16 cannot hold steps of a thousandth.
+    The average is kept outside the module, so that optimiser, DDP and ``state_dict`` do not see it; torch's
+    ``AveragedModel`` is a copy of the module with one number of updates for all parameters. The decay grows from 0.1 to
+    the given value as (1 + n) / (10 + n) over the first updates n of a parameter, so that the average of a short run
+    is not dominated by the initial weights; after 9,000 updates it is 0.999. Averages are always float32, because
+    bfloat16 cannot hold steps of a thousandth.
 
     Attributes:
         parameters: name -> trained parameter. average: name -> its average. counts: name -> number of its updates.
@@ -51,11 +39,6 @@ class WeightAverage:
         self.decay, self.parameters = decay, dict(parameters)
         self.counts = dict.fromkeys(self.parameters, 0)
         self.average = {name: one.detach().to(torch.float32, copy=True) for name, one in self.parameters.items()}
-
-    @property
-    def updates(self) -> int:
-        """Number of updates of the parameter that has been averaged the longest."""
-        return max(self.counts.values(), default=0)
 
     @torch.no_grad()
     def update(self) -> None:
@@ -83,50 +66,42 @@ class WeightAverage:
             for name, parameter in self.parameters.items():
                 parameter.data = trained[name]
 
-    def state(self) -> tuple[dict[str, Tensor], dict[str, str]]:
-        """Return tensors and metadata of the file that `states_of` reads.
-
-        They are the trained weights, and the averages that the precision of the model's file would round.
-        """
+    def save(self, folder: Path) -> None:
+        """Write the trained weights, and the averages that the precision of the model's file would round."""
         tensors = {f"weights.{name}": parameter.detach().contiguous() for name, parameter in self.parameters.items()}
         for name, parameter in self.parameters.items():
             if parameter.dtype != torch.float32:
                 tensors[f"average.{name}"] = self.average[name]
-        others = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != self.updates}
-        return tensors, {"updates": str(self.updates), **others}
-
-    def save(self, folder: Path) -> None:
-        """Write the trained weights into a checkpoint's folder."""
+        longest = max(self.counts.values(), default=0)
+        others = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
         folder.mkdir(parents=True, exist_ok=True)
-        tensors, metadata = self.state()
-        save_file(tensors, folder / TRAINING_FILE, metadata=metadata)
+        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **others})
 
     @torch.no_grad()
-    def restore(self, states: Mapping[str, Averaged]) -> list[str]:
-        """Restore trained weights, averages and numbers of updates in a module that holds the average.
+    def restore(self, path: Path, names: Collection[str]) -> list[str]:
+        """Restore weights, averages and numbers of updates of these parameters in a module that holds the average.
 
         Returns:
             Names of parameters without a saved state; their average starts at their present weights.
+
+        Raises:
+            MemobenchError: the file cannot be read, or does not fit.
         """
-        for name in states.keys() & self.parameters.keys():
-            parameter, (weights, average, self.counts[name]) = self.parameters[name], states[name]
-            held = parameter.detach() if average is None else average
-            self.average[name] = held.to(parameter.device, torch.float32, copy=True)
+        with undamaged(path), safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+        tensors: Mapping[str, Tensor] = read_tensors(path)
+        found = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
+        for name, weights in found.items():
+            parameter = self.parameters[name]
+            if weights.shape != parameter.shape:
+                raise MemobenchError(
+                    f"{path} holds '{name}' in another shape than this policy; copy the checkpoint again"
+                )
+            average = tensors.get(f"average.{name}", parameter.detach())  # else the model's file holds it exactly
+            self.average[name] = average.to(parameter.device, torch.float32, copy=True)
+            self.counts[name] = int(metadata.get(f"updates.{name}", metadata["updates"]))
             parameter.copy_(weights.to(parameter.device))
-        return [name for name in self.parameters if name not in states]
-
-
-def states_of(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> dict[str, Averaged]:
-    """Return name -> state of each parameter of a `WeightAverage.state`."""
-    names = [key.removeprefix("weights.") for key in tensors if key.startswith("weights.")]
-    return {
-        name: Averaged(
-            tensors[f"weights.{name}"],
-            tensors.get(f"average.{name}"),
-            int(metadata.get(f"updates.{name}", metadata["updates"])),
-        )
-        for name in names
-    }
+        return [name for name in self.parameters if name not in found]
 
 
 def begin_average(policy: Any) -> WeightAverage | None:
@@ -147,14 +122,7 @@ def begin_average(policy: Any) -> WeightAverage | None:
     if path is None:
         return average
     trained: Any = as_trained(source, config, revision)
-    with undamaged(path), safe_open(path, framework="pt") as file:
-        metadata = file.metadata()
-    held = states_of(read_tensors(path), metadata)
-    states = {name: held[name] for name in held.keys() & average.parameters.keys() - restarted(policy, trained)}
-    wrong = sorted(name for name, one in states.items() if one.weights.shape != average.parameters[name].shape)
-    if wrong:
-        raise MemobenchError(f"{path} holds '{wrong[0]}' in another shape than this policy; copy the checkpoint again")
-    new = average.restore(states)
+    new = average.restore(path, average.parameters.keys() - restarted(policy, trained))
     if new:
         logger.info("the average continues from '%s'; that of %s starts again", source, ", ".join(new))
     return average

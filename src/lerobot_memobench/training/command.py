@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
+import shlex
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lerobot_memobench.datasets.lerobot_format.damage import check_whole, naming_damage
-from lerobot_memobench.datasets.lerobot_format.layout import DEFAULT_REPO_ID, INFO_FILE
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
+from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
@@ -24,19 +22,30 @@ from lerobot_memobench.jobs.processes import adding_resume_hint, locked
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
 from lerobot_memobench.policies.checkpoint import (
+    LAST,
+    TRAIN_CONFIG,
     as_trained,
+    check_as_begun,
     check_checkpoint,
+    check_processors,
     check_weights,
+    checkpoint_folder,
+    checkpoint_type,
+    checkpoints_of,
     differing,
     local_folder,
     looks_local,
     read_json,
+    text_of_link,
 )
 from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
 from lerobot_memobench.run.command_line import (
+    CONFIG_FILE,
     HELP,
     PATH,
+    RECIPE,
     TRAINING_OPTIONS,
+    TYPE,
     CommandSettings,
     read_words,
     resolve_recipe,
@@ -45,13 +54,6 @@ from lerobot_memobench.run.command_line import (
     without,
 )
 from lerobot_memobench.run.lerobot_commands import call_lerobot
-from lerobot_memobench.training.resume import (
-    check_same_training,
-    make_room_for_link,
-    note_on_resume,
-    resume_hint,
-    resumed,
-)
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
@@ -61,77 +63,70 @@ OBJECT_BATCH = 72
 """Default frames per update of a policy whose samples are in main memory: a dozen episodes, six frames of each."""
 SHORT_TRAINING = 2000
 """Updates below which losses are logged ten times; LeRobot's default of every 200 updates would log too few."""
-TRAINED = ("policy.type", "policy.path", "reward_model.type", "reward_model.path")
-"""Settings that name the model to train."""
 SMALLEST = {"steps": 1, "batch_size": 1, "num_workers": 0, "eval.batch_size": 0, "eval.n_episodes": 1}
-"""Setting -> its smallest value."""
+"""Setting -> its smallest value; LeRobot checks none of them."""
+READ = frozenset(
+    {
+        *("batch_size", "checkpoint_path", "cudnn_deterministic", "dataloader_multiprocessing_context", "dataset"),
+        *("env", "env_eval_freq", "eval", "eval_steps", "job_name", "log_freq", "max_eval_samples", "num_workers"),
+        *("optimizer", "output_dir", "peft", "persistent_workers", "policy", "prefetch_factor", "rename_map", "resume"),
+        *("save_checkpoint", "save_checkpoint_to_hub", "save_freq", "scheduler", "seed", "steps", "tolerance_s"),
+        *("use_policy_training_preset", "wandb"),
+    }
+)
+"""Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
+TRAINING_STEP = Path("training_state") / "training_step.json"
+OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
+"""Beginnings of settings that a saved optimizer overrides."""
+NOT_COMPARED = {
+    *("dataset.root", "dataset.repo_id", "log_freq", "num_workers", "output_dir", "resume", "save_freq", "steps")
+}
+"""Settings of a resumed training that other checks compare, or that change nothing that is learned."""
 
 
-def train(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
-    """Run ``lerobot train``; return the exit status.
-
-    Args:
-        words: of the command line (`run.command_line.parse_words`).
-        notify: called with notes.
-    """
-    begun = time.time()
-    prompt_frames, obs_type, rest = take_training_options(resolve_recipe(resumed(words)))
+def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
+    """Run ``lerobot train`` by the words of `run.command_line.parse_words`; return the exit status."""
+    prompt_frames, obs_type, rest = take_training_options(resolve_recipe(with_last_checkpoint(words)))
     asked = read_words("train", rest)
     if HELP in words:
         return call_lerobot("train", ["--help", *(f"--{word}" for word in spelled(asked.words))])
-    asked, config = complete_training(asked, notify)
-    note, updates_left = note_on_resume(asked, config)
-    if note is not None:
-        notify(note)
-    if not updates_left:
-        return 0
-    make_room_for_link(asked)
+    config = complete_training(asked, notify)
+    if config.checkpoint_path is not None:
+        done = step_reached(config.checkpoint_path)
+        if done >= config.steps:
+            run = config.checkpoint_path.parents[1]
+            notify(f"the training in {run} has finished its {done} steps; for more, set steps=")
+            return 0
+        make_room_for_link(config.checkpoint_path.with_name(LAST))
     root = config.dataset.root
     with (
-        adding_resume_hint("lerobot", lambda: resume_hint(asked, words, begun)),
-        locked_run(config),
+        adding_resume_hint("lerobot", lambda: resume_hint(config, words)),
+        locked_run(asked.get("output_dir")),
         naming_damage(Path(root) if root else None),
     ):
         if config.policy is not None and config.policy.type == MEMORY_POLICY:
-            from lerobot_memobench.training.configuration import complete
-            from lerobot_memobench.training.loop import train as train_memory_policy
+            from lerobot_memobench.training.loop import train
 
-            train_memory_policy(complete(config, asked))
+            train(config)
             return 0
-        from lerobot_memobench.training.view import viewed
+        from lerobot_memobench.training.trainer import prepare, run_lerobot
 
-        status = run_lerobot(viewed(config, prompt_frames, obs_type, notify), asked.config_path)
+        status = run_lerobot(prepare(config, prompt_frames, obs_type, notify))
         if status and root and (Path(root) / INFO_FILE).is_file() and config.dataset.episodes is None:
             check_whole(Path(root))  # LeRobot's error does not name the damaged file
         return status
 
 
-def run_lerobot(config: TrainPipelineConfig, config_path: str | None) -> int:
-    """Run LeRobot's trainer, with samples in memory, in a process of its own; return its exit status.
-
-    Args:
-        config_path: the file or repository of a resumed training.
-    """
-    import draccus
-
-    line = [f"--config_path={config_path}"] if config.resume and config_path is not None else []
-    command = [sys.executable, "-m", "lerobot_memobench.training.samples", *line]
-    return subprocess.run(command, input=json.dumps(draccus.encode(config)).encode(), check=False).returncode
-
-
 @contextmanager
-def locked_run(config: TrainPipelineConfig) -> Iterator[None]:
-    """Lock the folder of a training, in its first process.
+def locked_run(folder: str | None) -> Iterator[None]:
+    """Lock the folder of a training if it is named, in its first process; refuse it if another training holds the lock.
 
     The lock is a file next to the folder, because LeRobot refuses a folder that exists before its first checkpoint.
-
-    Raises:
-        MemobenchError: another training holds the lock.
     """
-    if config.output_dir is None or os.environ.get("RANK", "0") != "0":
+    if folder is None or os.environ.get("RANK", "0") != "0":
         yield
         return
-    run = Path(config.output_dir).expanduser().absolute()
+    run = Path(folder).expanduser().absolute()
     run.parent.mkdir(parents=True, exist_ok=True)
     lock = run.with_name(f".{run.name}.lock")
     lock.touch()
@@ -163,19 +158,17 @@ def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | 
     return prompts, obs_type, rest
 
 
-def complete_training(
-    asked: CommandSettings, notify: Callable[[str], None] = print
-) -> tuple[CommandSettings, TrainPipelineConfig]:
-    """Check a training's settings and add the benchmark's defaults; return them and the configuration.
+# -- configuration -----------------------------------------------------------------------------------------------------
 
-    Args:
-        notify: called with notes.
+
+def complete_training(asked: CommandSettings, notify: Callable[[str], None] = print) -> TrainPipelineConfig:
+    """Return the configuration of a training with the benchmark's defaults, checked and completed by LeRobot.
 
     Raises:
-        MemobenchError: no policy is named, a number is too small, the dataset or the checkpoint cannot be used, or a
-            resumed training has other settings.
+        MemobenchError: no policy is named, settings do not go together, the dataset or the checkpoint cannot be used,
+            or a resumed training has other settings.
     """
-    if not any(asked.get(key) for key in TRAINED):
+    if not (asked.get("policy") or asked.get("reward_model")):
         raise MemobenchError("name a policy: policy=memobench_mem")
     asked = asked.default("dataset.repo_id", DEFAULT_REPO_ID)
     if asked.get("policy") and asked.get("policy.repo_id") is None:  # LeRobot would require one
@@ -186,9 +179,15 @@ def complete_training(
     if path is not None:
         check_checkpoint(path)
     asked, config = build_training(with_memory_defaults(asked))
-    check_numbers(config)
-    check_same_training(asked, config)
+    for key, smallest in SMALLEST.items():
+        if (given := attrgetter(key)(config)) < smallest:
+            raise MemobenchError(f"found {key}={given}; expected at least {smallest}")
     policy: Any = config.policy
+    if getattr(policy, "type", None) == MEMORY_POLICY:
+        check_settings(config)
+    check_with_lerobot(config, asked)
+    if config.checkpoint_path is not None:
+        check_same_training(asked, config, config.checkpoint_path, notify)
     if policy is not None:
         check_sizes(policy)
         check_memory_settings(asked, policy)
@@ -208,14 +207,11 @@ def complete_training(
         config.batch_size = OBJECT_BATCH
     if asked.get("num_workers") is None and cores() < 4:  # LeRobot's default is four loaders
         config.num_workers = cores()
-    return asked, config
+    return config
 
 
 def build_training(asked: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
-    """Return the settings and the configuration.
-
-    Settings of a checkpoint that have no effect under the settings of the command line are reset to their defaults.
-    """
+    """Return settings and configuration; settings of a checkpoint that have no effect under them get their defaults."""
     try:
         return asked, asked.build()
     except MemobenchError as error:
@@ -243,14 +239,54 @@ def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
     return replace(asked, words={**defaults, **asked.words})
 
 
-def check_numbers(config: TrainPipelineConfig) -> None:
-    """Refuse numbers below `SMALLEST`."""
-    for key, smallest in SMALLEST.items():
-        found: Any = config
-        for part in key.split("."):
-            found = getattr(found, part)
-        if found < smallest:
-            raise MemobenchError(f"found {key}={found}; expected at least {smallest}")
+def check_with_lerobot(config: TrainPipelineConfig, asked: CommandSettings) -> None:
+    """Let LeRobot check a configuration and complete its folder, job, optimizer and resumed checkpoint.
+
+    Raises:
+        MemobenchError: LeRobot refuses it, or the folder of a new training exists.
+    """
+    if not config.resume and config.output_dir is not None and config.output_dir.is_dir():
+        raise MemobenchError(
+            f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training with "
+            "resume=true"
+        )
+    given = {CONFIG_FILE: asked.config_path, "output_dir": asked.words.get("output_dir")} if config.resume else {}
+    line, sys.argv = sys.argv, [sys.argv[0], *(f"--{key}={value}" for key, value in given.items() if value is not None)]
+    try:
+        config.validate()  # it reads the checkpoint and the folder of a resumed training from `sys.argv`
+    except (ValueError, FileNotFoundError) as error:
+        raise MemobenchError(" ".join(str(error).split())) from None
+    finally:
+        sys.argv = line
+
+
+def check_settings(config: TrainPipelineConfig) -> None:
+    """Refuse settings that have no effect on the training of a memory policy."""
+    policy: Any = config.policy
+    unused = type(config)(config.dataset)
+    for name, value in vars(config).items():
+        for setting, given in () if name in READ else changes(name, value, getattr(unused, name, None)):
+            raise MemobenchError(f"{setting}={given} has no effect on policy={policy.type}; leave it out")
+    encodes_ahead = policy.uses_detector or policy.uses_visual_encoder
+    encoded = config.dataset.image_transforms.enable and encodes_ahead
+    refused = [
+        (config.dataset.streaming, "dataset.streaming=true", "memory needs all frames of an episode"),
+        (policy.use_amp, "policy.use_amp=true", "policy.dtype sets the precision"),
+        (config.eval.recording, "eval.recording=true", "rollouts of a training are not recorded"),
+        (encoded, "dataset.image_transforms.enable=true", "images are encoded once, before training"),
+    ]
+    for present, setting, why in refused:
+        if present:
+            raise MemobenchError(f"{setting} has no effect on policy={policy.type} ({why}); leave it out")
+
+
+def changes(name: str, value: object, default: object) -> Iterator[tuple[str, object]]:
+    """Yield name and value of the settings of a field that differ from its default."""
+    if is_dataclass(value) and is_dataclass(default):
+        for one in fields(value):
+            yield from changes(f"{name}.{one.name}", getattr(value, one.name), getattr(default, one.name, None))
+    elif value != default:
+        yield name, value
 
 
 def check_dataset(asked: CommandSettings) -> None:
@@ -273,9 +309,172 @@ def check_dataset(asked: CommandSettings) -> None:
 
 
 def check_memory_settings(asked: CommandSettings, policy: Any) -> None:
-    """Refuse settings on the command line that belong to another memory; errors as of `read_settings`."""
+    """Refuse settings on the command line that belong to another memory; a checkpoint's may."""
     from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
 
     given = asked.words.get("policy.memory_settings")
     if given and getattr(policy, "memory", NONE) != NONE:
         read_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], given))
+
+
+# -- resumed trainings -------------------------------------------------------------------------------------------------
+
+
+def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
+    """Return the words of LeRobot to resume a training, if ``output_dir=<run> resume=true`` is given.
+
+    LeRobot needs the path of the configuration in the run's last checkpoint. That holds all settings of the run;
+    settings on the command line override it.
+
+    Raises:
+        MemobenchError: there is no checkpoint, a recipe is named, or another policy than that of the run.
+    """
+    if not value_of("resume", bool, words.get("resume", "false")):
+        return dict(words)
+    stated = words.get(CONFIG_FILE)
+    is_recipe = RECIPE in words or (stated and Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG)
+    if is_recipe:
+        key = RECIPE if RECIPE in words else CONFIG_FILE
+        raise MemobenchError(
+            f"{key}={words[key]} cannot be combined with resume=true, which uses the configuration in the last "
+            "checkpoint; leave the recipe out, and change settings by key=value"
+        )
+    if stated is not None:
+        return dict(words)  # LeRobot's own form: a checkpoint or a repository
+    folder = words.get("output_dir")
+    if folder is None:
+        raise MemobenchError("resume=true needs the folder of the training: output_dir=<folder>")
+    checkpoint = last_checkpoint(Path(folder).expanduser())
+    checkpoint_type(str(checkpoint))
+    begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
+    kind = named = words.get("policy") or words.get(f"policy.{TYPE}")
+    if named is not None and (source := checkpoint_folder(named)) is not None:
+        kind = checkpoint_type(str(source))
+    if kind is not None and begun is not None and "/" not in kind and kind != begun:
+        raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={named}; leave policy out")
+    return {
+        CONFIG_FILE: str(checkpoint / TRAIN_CONFIG),
+        **without(words, "policy", f"policy.{PATH}", f"policy.{TYPE}"),
+    }
+
+
+def last_checkpoint(run: Path) -> Path:
+    """Return the folder ``pretrained_model`` of the last complete checkpoint of a run; raise if there is none."""
+    for folder in complete_checkpoints(run):
+        return folder / "pretrained_model"
+    problem = "holds no complete checkpoint" if run.is_dir() else "does not exist"
+    raise MemobenchError(
+        f"output_dir={run} {problem}; the first checkpoint is saved after save_freq steps: leave resume=true out and "
+        "name a new folder"
+    )
+
+
+def complete_checkpoints(run: Path) -> Iterator[Path]:
+    """Yield the complete checkpoints of a run, the last one first."""
+    for folder in checkpoints_of(run):
+        described = (folder / "pretrained_model" / TRAIN_CONFIG).is_file() and (folder / TRAINING_STEP).is_file()
+        # LeRobot sets the link when a checkpoint is complete; it writes the optimizer's groups nearly last.
+        if described and (folder.name == LAST or any(folder.glob("training_state/**/optimizer_param_groups.json"))):
+            yield folder
+
+
+def step_reached(checkpoint: Path) -> int:
+    """Return the step at which a checkpoint was saved."""
+    return int(read_json(checkpoint / TRAINING_STEP)["step"])
+
+
+def make_room_for_link(last: Path) -> None:
+    """Remove a file that a copy made of the link ``last`` of a training, because LeRobot makes the link."""
+    if last.is_symlink() or not last.exists():
+        return
+    named = text_of_link(last)
+    if not (named and named.isdecimal()):
+        raise MemobenchError(
+            f"{last} is not a link, and LeRobot makes a link of that name with each checkpoint; rename it, for example "
+            "to the number of its step"
+        )
+    last.unlink(missing_ok=True)  # another process of this training may remove it
+
+
+def check_same_training(
+    asked: CommandSettings, config: TrainPipelineConfig, checkpoint: Path, notify: Callable[[str], None]
+) -> None:
+    """Refuse to resume a training with another dataset, or with settings that it cannot change; note the others."""
+    begun, model = asked.begun, checkpoint / "pretrained_model"
+    another = f"train a new run from the checkpoint: policy={model} output_dir=<new folder>"
+    check_processors(model)
+    _check_same_dataset(config.dataset, begun.dataset, another)
+    changed = []
+    for name in asked.words:
+        try:
+            value, held = (attrgetter(name)(one) for one in (config, begun))
+        except AttributeError:  # a setting of another type of optimizer
+            continue
+        if name in NOT_COMPARED or value == held:
+            continue
+        if name.startswith(OF_OPTIMIZER):
+            raise MemobenchError(
+                f"this training was begun with {name}={held}, which its saved optimizer keeps; found {value}; leave "
+                f"{name.removeprefix('policy.')} out, or {another}"
+            )
+        if not name.startswith("policy."):  # see `check_as_begun`
+            changed.append(f"{name}={value} instead of {held}")
+    if config.policy is not None and begun.policy is not None:
+        check_as_begun(model, config.policy, begun.policy)
+    done = step_reached(checkpoint)
+    if done < config.steps:
+        if changed:
+            notify(f"note: this training continues with {', '.join(changed)}")
+        if note := note_on_schedule(begun, config.steps, done):
+            notify(note)
+
+
+def _check_same_dataset(found: Any, begun: Any, another: str) -> None:
+    """Refuse another dataset, other episodes or another revision than a training was begun with."""
+    roots = [Path(one.root).expanduser().resolve() if one.root else None for one in (found, begun)]
+    if roots[0] != roots[1] or (roots[0] is None and found.repo_id != begun.repo_id):
+        held = begun.root or begun.repo_id
+        moved = begun.root is not None and not Path(held).expanduser().exists()
+        raise MemobenchError(
+            f"this training was begun on the dataset {held}; found {found.root or found.repo_id}; "
+            + (f"if it is the same dataset, move it or link it to {held}; else " if moved else "")
+            + f"leave it out, or {another}"
+        )
+    for name in ("episodes", "revision"):
+        value, held = getattr(found, name), getattr(begun, name)
+        if value != held:
+            raise MemobenchError(
+                f"this training was begun with dataset.{name}={held}; found {value}; leave it out, or {another}"
+            )
+
+
+def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str | None:
+    """Return a note if another number of steps makes the learning rate of a resumed training jump at the step reached.
+
+    LeRobot builds the schedule for the new number and continues in it at that step.
+    """
+    from torch import nn, optim
+
+    if steps == begun.steps or begun.scheduler is None or begun.optimizer is None:
+        return None
+    rates = []
+    for total in (begun.steps, steps):
+        made = begun.scheduler.build(optim.SGD(nn.Linear(1, 1).parameters(), lr=1.0), total)
+        rates.append(getattr(made, "lr_lambdas", [lambda _: 1.0])[0](done) * getattr(begun.optimizer, "lr", 1.0))
+    before, after = (f"{rate:.2e}" for rate in rates)
+    if before == after:
+        return None
+    return (
+        f"note: with {steps} steps instead of {begun.steps} the learning rate at step {done} jumps from {before} to "
+        f"{after} ({begun.scheduler.type})"
+    )
+
+
+def resume_hint(config: TrainPipelineConfig, words: Mapping[str, str]) -> str:
+    """Return the advice for a training that was terminated: the command that resumes from its last checkpoint."""
+    assert config.output_dir is not None
+    if not any(complete_checkpoints(config.output_dir)):
+        return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *spelled(words)])}"
+    kept = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
+    again = spelled({"output_dir": str(config.output_dir), "resume": "true", **kept})
+    return f"go on with: {shlex.join(['lerobot', 'train', *again])}"

@@ -1,4 +1,4 @@
-"""Open the data of a training: datasets, the lookup of their frames, samples and processors."""
+"""Open the data of a training: datasets, texts, the lookup of frames, samples and processors."""
 
 from __future__ import annotations
 
@@ -11,49 +11,68 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.configs import FeatureType
+from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.factory import make_train_eval_datasets
+from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lerobot_memobench.datasets.episodes import STRANGER, list_episodes
 from lerobot_memobench.datasets.frames import (
+    LEVEL_COLUMNS,
+    MEMORY_COLUMN,
     Encoded,
     FrameLookup,
+    FrameTable,
     Remember,
     SamplesInMemory,
-    TextEncoder,
     read_frame_table,
     read_recorded,
 )
-from lerobot_memobench.datasets.lerobot_format.columns import EPISODE_INFO, check_clock
-from lerobot_memobench.datasets.lerobot_format.layout import without_pattern
-from lerobot_memobench.datasets.lerobot_format.reading import check_revision, list_episodes
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.layout import EPISODE_INFO, without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
+from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import count_of
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.compatibility import check_features, trained_convention
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    ANSWERS,
+    PROGRESS,
+    SHUFFLED,
+    MemobenchMemConfig,
+)
 from lerobot_memobench.policies.memobench_mem.encoders import (
     ImageTowerEncoder,
     ObservationEncoder,
     VisualTokenEncoder,
     encoded_key,
 )
+from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.objects import DETECTED, OBS_RAW_STATE, VIEWS, DetectionEncoder
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     follow_training,
     make_memobench_mem_pre_post_processors,
 )
-from lerobot_memobench.policies.memobench_mem.text_encoders import make_text_encoder
+from lerobot_memobench.policies.memobench_mem.texts import (
+    answers,
+    make_text_encoder,
+    progress,
+    shuffled,
+    subgoals_of,
+    texts_of,
+)
 from lerobot_memobench.protocol import OBS_PHASE
-from lerobot_memobench.sim.scene_hash import check_world
-from lerobot_memobench.training.features import cameras_of, detections, picture_tokens, remembered_features
+from lerobot_memobench.sim.convention import convention_of
+from lerobot_memobench.training.features import detected_slots, picture_features
 from lerobot_memobench.training.sampler import seed_of
-from lerobot_memobench.training.texts import set_subgoals, with_targets
 
 logger = logging.getLogger(__name__)
 
@@ -68,10 +87,8 @@ class Training:
     """A policy and its training data.
 
     Attributes:
-        policy: possibly with adapters. processors: pre- and postprocessor.
-        dataset: the episodes to train on. held_out: the held-out episodes, or None.
-        lookup: all frames of the dataset.
-        seed: of augmentations.
+        policy: possibly with adapters. processors: pre- and postprocessor. dataset: the episodes to train on.
+        lookup: all frames of the dataset. seed: of augmentations.
     """
 
     policy: Any
@@ -94,9 +111,6 @@ class Training:
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
     """Make or load the policy of a training, compute missing features, and make the processors.
 
-    Args:
-        datasets: of `open_datasets`.
-
     Raises:
         MemobenchError: the dataset does not fit the policy.
     """
@@ -107,7 +121,7 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
     if config.peft is not None and not policy_config.use_peft:
         policy = policy.wrap_with_peft(peft_cli_overrides=asdict(config.peft))
     lookup = open_lookup(Path(dataset.meta.root), policy_config, policy.perception, config.rename_map)
-    processors = make_processors(config, dataset.meta, lookup)
+    processors = make_training_processors(config, dataset.meta, lookup)
     return Training(policy, processors, dataset, held_out, lookup, config.seed or 0)
 
 
@@ -118,51 +132,39 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
 
     Raises:
-        MemobenchError: the dataset lacks an episode, or an earlier version made it.
+        MemobenchError: the dataset lacks an episode, or another version made it.
     """
     opened = copy.copy(config)
-    if config.dataset.root is not None:
-        opened.dataset = replace(config.dataset, root=str(without_pattern(Path(config.dataset.root))))
-    given = opened.dataset
-    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
-    check_episodes(given.episodes, meta)
-    complete_statistics(config.policy, meta, given)
+    opened.dataset = replace(config.dataset)
+    complete_statistics(config.policy, open_metadata(opened.dataset), opened.dataset)
     train, held_out = make_train_eval_datasets(opened)
-    check_dataset_version(train.meta)
     return train, held_out
 
 
-def check_dataset_version(meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset that an earlier version of the benchmark made: of other scenes, goals, prompts or holds."""
-    check_clock(meta.features, meta.root)
-    if EPISODE_INFO not in meta.features:
-        return
-    places = list_episodes(Path(meta.root))
-    for place in places:
-        if place.record is not None:
-            check_world(place.record.world, f"episode {place.index} of {meta.root}")
-    check_revision(Path(meta.root), places)
+def open_metadata(given: DatasetConfig) -> LeRobotDatasetMetadata:
+    """Return the metadata of a training's dataset.
 
-
-def check_episodes(episodes: Sequence[int] | None, meta: LeRobotDatasetMetadata) -> None:
-    """Refuse episodes that a dataset lacks; LeRobot ignores them, and fails if no episode is left."""
-    if episodes is None:
-        return
-    absent = [episode for episode in episodes if episode >= meta.total_episodes]
-    if absent or not episodes:
+    Raises:
+        MemobenchError: another version of this package wrote the dataset, or the dataset lacks an episode. LeRobot
+            ignores a missing episode and fails if none is left.
+    """
+    if given.root is not None:
+        given.root = str(without_pattern(Path(given.root)))
+    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
+    if EPISODE_INFO in meta.features:
+        list_episodes(Path(meta.root))  # reads all records
+    absent = [episode for episode in given.episodes or () if episode >= meta.total_episodes]
+    if absent or given.episodes == []:
         raise MemobenchError(
-            f"found episodes={absent or episodes}, and the dataset {meta.root} has "
+            f"found episodes={absent or given.episodes}, and the dataset {meta.root} has "
             f"{count_of(meta.total_episodes, 'episode')}; choose from 0 to {meta.total_episodes - 1}, or leave "
             "episodes out for all"
         )
+    return meta
 
 
 def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
-    """Add missing statistics that a policy needs for normalisation to its dataset.
-
-    Args:
-        policy: its configuration. given: LeRobot's configuration of the dataset.
-    """
+    """Add missing statistics that a policy needs for normalisation to the dataset of LeRobot's ``DatasetConfig``."""
     root = Path(meta.root)
     missing = lacking(root, needed_by(policy, meta.features, given.use_imagenet_stats))
     if not missing:
@@ -172,46 +174,80 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -
     complete(root, missing, logger.warning)
 
 
+def with_features(policy: Any, features: dict[str, Any]) -> Any:
+    """Return a policy's configuration with a dataset's features, as LeRobot sets them; given inputs stay."""
+    unused = None if getattr(policy, "uses_pictures", True) else FeatureType.VISUAL
+    known = dataset_to_policy_features(features)
+    made = copy.copy(policy)
+    made.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
+    made.input_features = dict(policy.input_features or {}) or {
+        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
+    }
+    return made
+
+
+def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
+    """Refuse pictures of another convention than a continued checkpoint's, and evaluations on other pictures.
+
+    The environment of evaluations during a training receives the plans of the policy, on which holds depend.
+    """
+    policy, env, stated = config.policy, config.env, convention_of(features)
+    if policy is None:
+        return
+    if stated is not None and policy.pretrained_path is not None and not config.resume and policy.image_features:
+        found, why = trained_convention(str(policy.pretrained_path), policy)
+        if found not in (None, stated):
+            raise MemobenchError(
+                f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
+                f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} "
+                "--out <folder>`"
+            )
+    if not isinstance(env, MemobenchEnvConfig):
+        return
+    if stated not in (None, env.convention) and env.obs_type != OBJECTS:
+        raise MemobenchError(f"{meta.root} has pictures of convention={stated}; set env.convention={stated}")
+    if policy.type == "xvla":
+        raise MemobenchError(
+            "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
+            "checkpoints with `lerobot eval env=memobench`"
+        )
+    env.declare_plans(policy)
+    made = with_features(policy, features)
+    check_features(f"that learns from {meta.root}", made, env_to_policy_features(env), config.rename_map)
+
+
 # -- frames ------------------------------------------------------------------------------------------------------------
 
 
 def open_lookup(
     root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
 ) -> FrameLookup:
-    """Open the lookup of a dataset's frames; compute missing features first.
-
-    Args:
-        encoder: the policy's perception.
-        renamed: LeRobot's ``rename_map``: names of the dataset -> names of the policy.
+    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first.
 
     Raises:
         MemobenchError: the dataset lacks a column, or features cannot be computed.
     """
     in_data = {known: given for given, known in (renamed or {}).items()}
+    columns: dict[str, Tensor] = {}
+    encoded: dict[str, Encoded] = {}
     remember: Remember | None = None
     if isinstance(encoder, ImageTowerEncoder):
-        table = with_targets(read_frame_table(root), config, root)
-        if config.memory != "none":
-            remembered = encoder.memory_input
-            camera = in_data.get(remembered, remembered) or next(iter(cameras_of(read_info(root)["features"])), "")
-            remember = remembered_features(root, config, encoder, camera).tokens
-        return FrameLookup(root, table, stride=config.memory_stride, texts=text_encoder(config), remember=remember)
-    names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
-    columns, table = read_recorded(root, names)
+        table = read_frame_table(root)
+    else:
+        names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
+        columns, table = read_recorded(root, names)
+        logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     table = with_targets(table, config, root)
-    logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
-    encoded: dict[str, Encoded] = {}
-    if isinstance(encoder, VisualTokenEncoder):
-        cameras = dict.fromkeys(encoder.cameras or [*cameras_of(read_info(root)["features"]), encoder.memory_input])
-        memory, present = picture_tokens(root, config, encoder, {name: in_data.get(name, name) for name in cameras})
+    if isinstance(encoder, ImageTowerEncoder | VisualTokenEncoder):
+        memory, present = picture_features(root, config, encoder, in_data)
         encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
         remember = None if memory is None else memory.tokens
     else:
         observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
         if isinstance(encoder, DetectionEncoder):
             views = {name: in_data.get(name, name) for name in VIEWS}
-            found = detections(root, encoder.detect, views, in_data.get(OBS_STATE, OBS_STATE))
-            slots = found.all_frames().sum(dim=1, dtype=torch.float32)
+            stored = detected_slots(root, encoder.detect, views, in_data.get(OBS_STATE, OBS_STATE))
+            slots = stored.all_frames().sum(dim=1, dtype=torch.float32)
             observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
 
         def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
@@ -219,23 +255,91 @@ def open_lookup(
             return encoder.remember(observed, [first + slot * config.memory_stride for slot in slots])
 
         remember = remember_objects
-
+    # Without an alignment no embedding of a text is used, so the cheapest encoder does.
+    texts = make_text_encoder(
+        "words" if config.align == NONE else str(config.text_encoder), config.dimensions.text_dim, str(config.device)
+    )
     return FrameLookup(
         root,
         table,
         stride=config.memory_stride,
-        texts=text_encoder(config),
+        texts=texts,
         remember=remember,
         columns=columns,
         encoded=encoded,
     )
 
 
-def text_encoder(config: MemobenchMemConfig) -> TextEncoder:
-    """Return the text encoder of the subgoals for the alignment; without an alignment its output is not used."""
-    name = "words" if config.align == "none" else config.text_encoder
-    assert name is not None  # the configuration sets it
-    return make_text_encoder(name, config.dimensions.text_dim, str(config.device))
+# -- texts -------------------------------------------------------------------------------------------------------------
+
+
+def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Set the subgoals of a memory that learns from texts, and check that the dataset has all texts of the policy.
+
+    Raises:
+        MemobenchError: the dataset lacks texts, or has some that the memory does not know.
+    """
+    if config.align == NONE and not config.oracle_memory and not config.privileged_memory:
+        return
+    table, level = read_frame_table(Path(meta.root)), config.subgoal_level
+    levels = [one for one in LEVEL_COLUMNS if any(table.subgoals.get(one, []))]
+    if config.align != NONE and level not in levels:
+        fix = (
+            f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
+            if levels
+            else "use --policy.align=none, or a dataset that has the subgoal of each frame there"
+        )
+        raise MemobenchError(
+            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), so "
+            f"--policy.align={config.align} has no text to align memory with; {fix}."
+        )
+    if config.oracle_memory and not any(table.memory or []):
+        raise MemobenchError(
+            f"The dataset {meta.root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
+            "reads; leave it out, or generate the dataset again with this version."
+        )
+    if not config.privileged_memory:
+        return
+    own = subgoals_of(table.subgoals.get(level, []), table.episodes, meta.episodes["tasks"])
+    if not any(own.values()):
+        raise MemobenchError(
+            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), from "
+            "which this memory learns; name a dataset of `memobench generate`, another policy.subgoal_level, or "
+            "another policy.memory."
+        )
+    config.subgoals = config.subgoals or own
+    if new := sorted({*texts_of(own)} - {*texts_of(config.subgoals)}):
+        raise MemobenchError(
+            f"The dataset {meta.root} has {len(new)} checkpoint texts that this memory does not know, the first "
+            f"being {new[0]!r}; train on the tasks it was trained on, or train a new memory with "
+            "--policy.subgoals=null."
+        )
+
+
+def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> FrameTable:
+    """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals.
+
+    Raises:
+        MemobenchError: there is a single text to shuffle, or an episode's task is unknown.
+    """
+    level, texts = config.subgoal_level, table.subgoals.get(config.subgoal_level, [])
+    if config.align == NONE or not any(texts):
+        return table
+    if config.align_targets == SHUFFLED:
+        if len({*texts} - {""}) < 2:
+            raise MemobenchError(
+                f"The dataset of {root} has one subgoal at the level of the alignment, and --policy.align_targets="
+                f"{SHUFFLED} needs at least two; use a dataset of several tasks, or another --policy.subgoal_level."
+            )
+        texts = shuffled(texts, table.episodes)
+    elif config.align_targets == ANSWERS:
+        texts = answers(texts, table.episodes)
+    elif config.align_targets == PROGRESS:
+        records = [place.record for place in list_episodes(root)]
+        if None in records:
+            raise MemobenchError(f"The dataset {root} cannot be aligned with align_targets={PROGRESS}: {STRANGER}.")
+        texts = progress(texts, table.episodes, [record.task_name for record in records if record is not None])
+    return replace(table, subgoals={**table.subgoals, level: texts})
 
 
 # -- samples -----------------------------------------------------------------------------------------------------------
@@ -263,32 +367,22 @@ class DecodedSamples(Dataset[dict[str, Any]]):
 # -- processors --------------------------------------------------------------------------------------------------------
 
 
-def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup) -> tuple[Any, Any]:
+def make_training_processors(
+    config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
+) -> tuple[Any, Any]:
     """Return pre- and postprocessor of a training: new ones, or those of the checkpoint that it begins with."""
     policy: Any = config.policy
-    stats = {**meta.stats, **execution_statistics(policy, meta, lookup)}
+    stats = {**meta.stats, **execution_statistics(lookup)}
     if not policy.pretrained_path:
         return make_memobench_mem_pre_post_processors(policy, stats, meta, lookup)
-    normalizer: dict[str, Any] = {
-        "features": {**policy.input_features, **policy.output_features},
-        "norm_map": policy.normalization_mapping,
-    }
-    unnormalizer: dict[str, Any] = {**normalizer, "features": policy.output_features}
-    if not config.resume:  # a resumed training keeps its statistics
-        normalizer["stats"] = unnormalizer["stats"] = stats
+    kept: dict[str, Any] = {} if config.resume else {"stats": stats}  # a resumed training keeps its statistics
+    normalized = {**kept, "norm_map": policy.normalization_mapping}
     before: dict[str, Any] = {
         "device_processor": {"device": torch.device(policy.device).type},
-        "normalizer_processor": normalizer,
+        "normalizer_processor": {**normalized, "features": {**policy.input_features, **policy.output_features}},
         "rename_observations_processor": {"rename_map": config.rename_map},
     }
-    after: dict[str, Any] = {"unnormalizer_processor": unnormalizer}
-    if policy.use_relative_actions:
-        before["relative_actions_processor"] = {
-            "enabled": True,
-            "exclude_joints": policy.relative_exclude_joints,
-            "action_names": policy.action_feature_names,
-        }
-        after["absolute_actions_processor"] = {"enabled": True}
+    after: dict[str, Any] = {"unnormalizer_processor": {**normalized, "features": policy.output_features}}
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=policy,
         pretrained_path=policy.pretrained_path,
@@ -300,28 +394,11 @@ def make_processors(config: TrainPipelineConfig, meta: LeRobotDatasetMetadata, l
     return preprocessor, postprocessor
 
 
-def execution_statistics(
-    config: MemobenchMemConfig, meta: LeRobotDatasetMetadata, lookup: FrameLookup
-) -> dict[str, dict[str, Any]]:
-    """Return the statistics of states and actions over frames to learn from; {} if LeRobot makes the samples.
-
-    Statistics of relative actions depend on the chunk and are the dataset's.
-
-    Raises:
-        MemobenchError: actions are relative, and the dataset has statistics of absolute actions.
-    """
+def execution_statistics(lookup: FrameLookup) -> dict[str, dict[str, Any]]:
+    """Return the statistics of states and actions over frames to learn from; {} if LeRobot makes the samples."""
     if not lookup.columns:
         return {}
     columns = {name: lookup.columns[name].numpy() for name in (OBS_STATE, ACTION)}
     found = {name: get_feature_stats(one[lookup.acts], axis=0, keepdims=False) for name, one in columns.items()}
-    if config.use_relative_actions:
-        found[ACTION] = dict(meta.stats[ACTION])
-        if np.allclose(found[ACTION]["mean"], columns[ACTION].mean(axis=0), atol=1e-4):
-            raise MemobenchError(
-                f"the dataset {meta.root} has statistics of absolute actions, and "
-                "--policy.use_relative_actions=true normalises relative ones; recompute them "
-                "(`lerobot-edit-dataset --operation.type=recompute_stats --operation.relative_action=true "
-                f"--operation.chunk_size={config.chunk_size}`) or leave use_relative_actions out"
-            )
     found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STD_OFFSET
     return found

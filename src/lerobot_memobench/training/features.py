@@ -14,9 +14,8 @@ import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,16 +24,15 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
-from lerobot_memobench.datasets.images import FrameReader, frame_reader
-from lerobot_memobench.datasets.lerobot_format.tables import read_info
+from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.perception.visual_encoder import GRID, WIDTH, VisualEncoder
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged
-from lerobot_memobench.policies.memobench_mem.backbone import make_backbone
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -47,6 +45,8 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     thumbnails,
 )
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
+from lerobot_memobench.policies.memobench_mem.memory import NONE
+from lerobot_memobench.policies.memobench_mem.network import make_backbone
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_layout import SIZE
@@ -57,8 +57,6 @@ FOLDER = "feature_cache"
 TOKENS = "tokens"
 """Name of the tensor (n, P, D) in each file."""
 MOST_THREADS = 8
-BYTES = 2
-"""Of a bfloat16 number."""
 _SAMPLE = 1 << 16
 """Bytes of a video that are hashed at each of its start, middle and end."""
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
@@ -66,33 +64,21 @@ Progress = Callable[[int, int], None]
 """Called as progress(completed episodes, all episodes)."""
 
 
-@dataclass(frozen=True)
-class Features:
+class Features(NamedTuple):
     """An encoder of frames.
 
     Attributes:
-        key: identity of the encoder: weights and input size.
-        tokens_per_frame: P. dim: D.
+        key: identity of the encoder: weights and input size. size: numbers of a frame.
         make: maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
     """
 
     key: str
-    tokens_per_frame: int
-    dim: int
+    size: int
     make: Callable[..., Tensor]
-
-    @property
-    def frame_bytes(self) -> int:
-        """Bytes of a stored frame: 64 KiB at full size."""
-        return BYTES * self.tokens_per_frame * self.dim
 
 
 class EpisodeFeatures:
-    """Stored features of every ``stride``-th frame of each episode, read through memory maps.
-
-    Args:
-        episodes: (E + 1,) first frame of each episode.
-    """
+    """Stored features of every ``stride``-th frame of each episode, read through memory maps."""
 
     def __init__(self, folder: Path, episodes: np.ndarray, stride: int) -> None:
         self.folder, self._episodes, self._stride = folder, episodes, stride
@@ -157,7 +143,7 @@ def make_features(
         notify: called with the folder and its size before anything is encoded.
 
     Raises:
-        MemobenchError: ``root`` is not a dataset, lacks the camera, or the disk is full.
+        MemobenchError: the dataset lacks the camera, or the disk is full.
     """
     folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
     progress = progress or functools.partial(logger.info, "feature cache: %d of %d episodes")
@@ -167,7 +153,7 @@ def make_features(
     if not missing:
         return EpisodeFeatures(folder, table.episodes, stride)
     read = read or frame_reader(root, camera)
-    needed, free = int(counts[missing].sum()) * features.frame_bytes, free_bytes(folder)
+    needed, free = int(counts[missing].sum()) * features.size * torch.bfloat16.itemsize, free_bytes(folder)
     notify(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
     if needed > free:
         raise MemobenchError(
@@ -200,15 +186,7 @@ def _keep_from_the_hub(root: Path) -> None:
 
 
 def dataset_fingerprint(root: Path, camera: str) -> str:
-    """Hash the frame tables in full, and the camera's videos by their size and three samples each.
-
-    Raises:
-        MemobenchError: ``root`` is not a LeRobotDataset.
-    """
-    if not (root / "meta" / "info.json").is_file():
-        raise MemobenchError(
-            f"{root} is not a LeRobotDataset (meta/info.json is missing); name the folder of meta, data and videos"
-        )
+    """Hash the frame tables in full, and the camera's videos by their size and three samples each."""
     digest = hashlib.blake2b(digest_size=12)
     for path in files_below(root / "data", ".parquet"):
         digest.update(str(path.relative_to(root)).encode())
@@ -231,54 +209,44 @@ def cameras_of(features: Mapping[str, Any]) -> list[str]:
 # -- features of each kind of policy -----------------------------------------------------------------------------------
 
 
-SMALL = Features(THUMBNAILS, 1, THUMBNAIL**2, thumbnails)
-"""Grey thumbnails, for a memory of motion."""
-
-
-def remembered_features(
-    root: Path, config: MemobenchMemConfig, encoder: ImageTowerEncoder, camera: str, **how: Any
-) -> EpisodeFeatures:
-    """Make the memory's features for a policy with an image tower: pooled tokens, or thumbnails.
-
-    Args:
-        camera: the dataset's name of the remembered camera. how: of `make_features`.
-    """
-    prefix, features = f"{config.size}-stride{config.memory_stride}", SMALL
-    if config.remembers_thumbnails:
-        prefix = f"thumbnails-stride{config.memory_stride}"
-    else:
-        features = Features(encoder.key, encoder.tokens_per_frame, encoder.dim, encoder)
-    return make_features(root, prefix, features, camera=camera, stride=config.memory_stride, **how)
-
-
-def picture_tokens(
-    root: Path, config: MemobenchMemConfig, encoder: VisualTokenEncoder, cameras: dict[str, str], **how: Any
+def picture_features(
+    root: Path,
+    config: MemobenchMemConfig,
+    encoder: ImageTowerEncoder | VisualTokenEncoder,
+    in_data: Mapping[str, str],
+    **how: Any,
 ) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
-    """Make a visual encoder's tokens of present pictures, and the memory's features.
+    """Make the features of the memory, None without one, and a visual encoder's tokens of present pictures.
 
     Pooled tokens are computed from the present ones, so that no video is decoded twice.
 
     Args:
-        cameras: the policy's name of each camera -> the dataset's. how: of `make_features`.
-
-    Returns:
-        The memory's features, None without a memory, and those of present pictures by the policy's name of the camera.
+        in_data: the policy's name of a camera -> the dataset's, where they differ. The present ones have the policy's.
+        how: of `make_features`.
     """
-    whole = Features(encoder.present_key, GRID**2, WIDTH, encoder.encode)
-    prefix = f"{config.size}-present"
-    present = {name: make_features(root, prefix, whole, camera=of, **how) for name, of in cameras.items()}
-    if config.memory == "none":
+    cameras, remembered, stride = cameras_of(read_info(root)["features"]), encoder.memory_input, config.memory_stride
+    present: dict[str, EpisodeFeatures] = {}
+    if isinstance(encoder, VisualTokenEncoder):
+        whole = Features(encoder.present_key, GRID**2 * WIDTH, encoder.encode)
+        for name in dict.fromkeys(encoder.cameras or [*cameras, remembered]):
+            camera = in_data.get(name, name)
+            present[name] = make_features(root, f"{config.size}-present", whole, camera=camera, **how)
+    if config.memory == NONE:
         return None, present
-    stride, remembered = config.memory_stride, encoder.memory_input
-    where: dict[str, Any] = {"camera": cameras[remembered], "stride": stride, **how}
+    kind: str = config.size
+    read: FrameReader | None = None
     if config.remembers_thumbnails:
-        return make_features(root, f"thumbnails-stride{stride}", SMALL, **where), present
-    pooled = Features(encoder.key, encoder.tokens_per_frame, WIDTH, encoder.pooled)
-    read = present[remembered].tokens
-    return make_features(root, f"{config.size}-stride{stride}", pooled, read=read, **where), present
+        kind, features = "thumbnails", Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
+    elif isinstance(encoder, VisualTokenEncoder):
+        features, read = Features(encoder.key, POOLED**2 * WIDTH, encoder.pooled), present[remembered].tokens
+    else:
+        features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
+    camera = in_data.get(remembered, remembered) or next(iter(cameras), "")
+    name = f"{kind}-stride{stride}"
+    return make_features(root, name, features, camera=camera, stride=stride, read=read, **how), present
 
 
-def detections(
+def detected_slots(
     root: Path, detect: ObjectsFromPictures, cameras: dict[str, str], state: str, **how: Any
 ) -> EpisodeFeatures:
     """Make a detector's object slots for every frame.
@@ -287,7 +255,6 @@ def detections(
 
     Args:
         cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
-        how: of `make_features`.
     """
     if convention_of(read_info(root)["features"]) == MIRRORED:
         raise MemobenchError(f"{root} has pictures of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
@@ -304,7 +271,7 @@ def detections(
         rounded = slots.to(torch.bfloat16)
         return torch.stack([rounded, (slots - rounded.float()).to(torch.bfloat16)], dim=1)
 
-    features = Features(detect.key, 2, SIZE, make)
+    features = Features(detect.key, 2 * SIZE, make)
     return make_features(root, "objects", features, camera=next(iter(cameras.values())), read=read, **how)
 
 
@@ -317,15 +284,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
     Args:
         weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
             random weights of a fixed seed.
-
-    Raises:
-        MemobenchError: the weights cannot be read or do not fit, or the policy has no tower.
     """
-    if config.uses_objects:
-        raise MemobenchError(
-            "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
-            "this command, or name a detector"
-        )
     with torch.device("meta"):
         model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
@@ -341,7 +300,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
 
 
 def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = None) -> VisualTokenEncoder:
-    """Load ``config``'s visual encoder alone; arguments and errors as of `load_image_tower`."""
+    """Load ``config``'s visual encoder alone, as `load_image_tower`."""
     source = weights or config.base_weights
     if source is None:
         assert config.visual_encoder is not None  # the configuration has one
@@ -354,12 +313,10 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
 
 
 def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path | None = None, **how: Any) -> Path:
-    """Make or complete the features of a dataset for a policy.
+    """Make or complete the features of a dataset for a policy, for example ``MemobenchMemConfig(size="tiny")``.
 
     Args:
-        config: a policy configuration, for example ``MemobenchMemConfig(size="tiny", memory_stride=1)``.
-        weights: checkpoint with the image tower or visual encoder, see `load_image_tower`.
-        how: of `make_features`.
+        weights: of `load_image_tower`. how: of `make_features`.
 
     Returns:
         Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder the memory's folder.
@@ -367,14 +324,15 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     Raises:
         MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.
     """
-    cameras = cameras_of(read_info(root)["features"])
-    config.memory_camera = config.memory_camera or next(iter(cameras), None)
+    config.memory_camera = config.memory_camera or next(iter(cameras_of(read_info(root)["features"])), None)
     if config.detector is not None:
         detect = ObjectsFromPictures(load_detector(config.detector))
-        return detections(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
-    camera = config.memory_camera or ""
-    if config.uses_visual_encoder:
-        encoder = load_token_encoder(config, weights)
-        memory, present = picture_tokens(root, config, encoder, {name: name for name in cameras or [camera]}, **how)
-        return (memory or next(iter(present.values()))).folder
-    return remembered_features(root, config, load_image_tower(config, weights), camera, **how).folder
+        return detected_slots(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
+    if config.uses_objects:
+        raise MemobenchError(
+            "perception=objects needs no feature cache without a detector: training reads the dataset's columns; skip "
+            "this command, or name a detector"
+        )
+    load = load_token_encoder if config.uses_visual_encoder else load_image_tower
+    memory, present = picture_features(root, config, load(config, weights), {}, **how)
+    return (memory or next(iter(present.values()))).folder

@@ -6,6 +6,7 @@ holds the raw weights, the model file their moving average. A resumed training c
 
 from __future__ import annotations
 
+import csv
 import ctypes
 import logging
 import platform
@@ -13,12 +14,14 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs, DistributedType
+from huggingface_hub.utils import tqdm
 from lerobot.common.train_utils import (
     get_step_checkpoint_dir,
     get_step_identifier,
@@ -27,34 +30,34 @@ from lerobot.common.train_utils import (
     update_last_checkpoint,
 )
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset
 from lerobot.envs import close_envs, make_env
+from lerobot.optim import load_optimizer_state, load_scheduler_state, save_optimizer_state, save_scheduler_state
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.scripts.lerobot_eval import eval_policy_all
 from lerobot.utils.collate import lerobot_collate_fn
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
-from lerobot.utils.random_utils import set_seed
-from lerobot.utils.utils import cycle, init_logging
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR, TRAINING_STEP
+from lerobot.utils.io_utils import write_json
+from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
+from lerobot.utils.random_utils import save_rng_state, set_seed
+from lerobot.utils.utils import cycle, init_logging, inside_slurm
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import read_json
 from lerobot_memobench.training.average import WeightAverage, begin_average
-from lerobot_memobench.training.configuration import check_environment
-from lerobot_memobench.training.data import Training, open_datasets, open_training
-from lerobot_memobench.training.log import TrainingLog
-from lerobot_memobench.training.sampler import FrameSampler, frame_sampler, seed_of, task_weights
-from lerobot_memobench.training.state import load_state, save_state
+from lerobot_memobench.training.data import Training, check_environment, open_datasets, open_training
+from lerobot_memobench.training.sampler import FrameSampler, seed_of, task_weights
 
 logger = logging.getLogger(__name__)
 
+LOSSES = "losses.csv"
+"""File of the run's folder: numbers of every ``log_freq`` updates, and of every evaluation."""
 DISTRIBUTED = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
 
 
 def train(config: TrainPipelineConfig) -> None:
-    """Train a memory policy until ``config.steps``, from the beginning or from ``config.checkpoint_path``.
-
-    Args:
-        config: complete, as of `configuration.complete`.
-    """
+    """Train a memory policy by a configuration of `command.complete_training`."""
     accelerator = begin(config)
     with accelerator.main_process_first():  # the others find the dataset downloaded
         datasets = open_datasets(config)
@@ -69,14 +72,14 @@ def train(config: TrainPipelineConfig) -> None:
         assert config.checkpoint_path is not None
         progress = load_state(config.checkpoint_path, optimizer, scheduler)
         step, batch_size = progress["step"], progress.get("batch_size") or config.batch_size
-        sampler.go_on(step, batch_size, progress.get("num_processes") or accelerator.num_processes)
+        sampler.resume_from(step, batch_size, progress.get("num_processes") or accelerator.num_processes)
 
     loader = make_loader(config, training, training.samples(), sampler=sampler)
     held_out_loader = None if training.held_out is None else make_held_out_loader(config, training)
     model, optimizer, loader, scheduler, held_out_loader = accelerator.prepare(
         training.policy, optimizer, loader, scheduler, held_out_loader
     )
-    run = Run(config, accelerator, training, model, average, optimizer, scheduler)
+    state = TrainingState(config, accelerator, training, model, average, optimizer, scheduler)
     log, batches = TrainingLog(config, training.dataset, accelerator, step), cycle(loader)
     model.train()
     seed = torch.initial_seed() if config.seed is None else config.seed
@@ -84,27 +87,27 @@ def train(config: TrainPipelineConfig) -> None:
         # Processes draw different noise, and a resumed training draws what an uninterrupted one does.
         set_seed(seed_of(seed, accelerator.process_index, step))
         begun = time.perf_counter()
-        batch = run.preprocessed(next(batches))
+        batch = state.preprocessed(next(batches))
         log.numbers.dataloading_s = time.perf_counter() - begun
-        log.note(run.update(batch))
+        log.note(state.update(batch))
         step += 1
         if config.log_freq > 0 and step % config.log_freq == 0:
             log.write(step)
         if held_out_loader is not None and config.eval_steps > 0 and step % config.eval_steps == 0:
-            log.write_held_out(step, run.held_out_loss(held_out_loader))
+            log.write_held_out(step, state.held_out_loss(held_out_loader))
         if config.save_checkpoint and should_save_checkpoint(step, config.save_freq, config.steps):
             if accelerator.is_main_process:
-                log.keep_model(run.save(step))
+                log.keep_model(state.save(step))
             accelerator.wait_for_everyone()
         if config.env is not None and config.env_eval_freq > 0 and step % config.env_eval_freq == 0:
             if accelerator.is_main_process:
-                log.write_evaluation(step, run.evaluate(step))
+                log.write_evaluation(step, state.evaluate(step))
             accelerator.wait_for_everyone()
     log.close()
     accelerator.wait_for_everyone()
     accelerator.end_training()  # LeRobot's main branch would wait for the others of the group in an upload
     if accelerator.is_main_process and policy_config.push_to_hub:
-        run.push()
+        state.push()
 
 
 def begin(config: TrainPipelineConfig) -> Accelerator:
@@ -138,13 +141,8 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
 
 
 @dataclass
-class Run:
-    """State of a training.
-
-    Attributes:
-        model: the policy as accelerate wraps it.
-        average: of its weights; None if there is none.
-    """
+class TrainingState:
+    """Model, as accelerate wraps it, weight average, optimizer and schedule of a training."""
 
     config: TrainPipelineConfig
     accelerator: Accelerator
@@ -274,7 +272,7 @@ def make_sampler(config: TrainPipelineConfig, training: Training) -> FrameSample
     policy, lookup, dataset = training.policy.config, training.lookup, training.dataset
     weights = policy.task_weights
     tasks = None if weights is None else task_weights(dataset.meta, lookup.episodes, lookup.phase, weights)
-    return frame_sampler(
+    return FrameSampler(
         lookup.episodes,
         lookup.acts,
         dataset.episodes,
@@ -315,7 +313,7 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
     """
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
-    frames = frame_sampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
+    frames = FrameSampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
     if config.max_eval_samples > 0:
         tasks, rows = dataset.hf_dataset.data.column("task_index").to_pylist(), dataset.absolute_to_relative_idx
         of_task: dict[int, list[int]] = {}
@@ -324,6 +322,158 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
         most = max(1, config.max_eval_samples // len(of_task))
         frames = [frame for task in sorted(of_task) for frame in of_task[task][:: -(-len(of_task[task]) // most)]]
     return make_loader(config, training, Subset(training.samples(dataset), frames))
+
+
+# -- state in a checkpoint ---------------------------------------------------------------------------------------------
+
+
+# Names and formats are those of LeRobot 0.6 and of its main branch, which read each other's files. The functions that
+# write all of them at once differ between the two.
+
+
+def save_state(checkpoint: Path, progress: dict[str, int], optimizer: Any, scheduler: Any) -> None:
+    """Write ``training_state`` of a checkpoint, the optimizer's parameter groups last.
+
+    Args:
+        progress: ``step`` and, per update, ``batch_size`` of a process and ``num_processes``.
+    """
+    folder = checkpoint / TRAINING_STATE_DIR
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json({**progress, "dp_world_size": progress["num_processes"]}, folder / TRAINING_STEP)
+    save_rng_state(folder)
+    if scheduler is not None:
+        save_scheduler_state(scheduler, folder)
+    save_optimizer_state(optimizer, folder)
+
+
+def load_state(checkpoint: Path, optimizer: Any, scheduler: Any) -> dict[str, int]:
+    """Restore optimizer and schedule of a checkpoint; return its ``progress``.
+
+    The random state is not restored: each update sets its own (`train`).
+    """
+    folder = checkpoint / TRAINING_STATE_DIR
+    progress = read_json(folder / TRAINING_STEP)
+    load_optimizer_state(optimizer, folder)
+    if scheduler is not None:
+        load_scheduler_state(scheduler, folder)
+    return progress
+
+
+# -- log ---------------------------------------------------------------------------------------------------------------
+
+
+class TrainingLog:
+    """Log a training: LeRobot's console lines, W&B if it is enabled, and a CSV file in the run's folder.
+
+    Attributes:
+        numbers: LeRobot's tracker: means since the last line.
+    """
+
+    def __init__(
+        self, config: TrainPipelineConfig, dataset: LeRobotDataset, accelerator: Accelerator, step: int
+    ) -> None:
+        assert config.output_dir is not None
+        self._first = accelerator.is_main_process
+        self._batch = config.batch_size * accelerator.num_processes
+        meters = {
+            "loss": AverageMeter("loss", ":.3f", reduction="mean"),
+            "grad_norm": AverageMeter("grdn", ":.3f"),
+            "lr": AverageMeter("lr", ":0.1e"),
+            "update_s": AverageMeter("updt_s", ":.3f", reduction="max"),
+            "dataloading_s": AverageMeter("data_s", ":.3f", reduction="max"),
+            "samples_per_s": AverageMeter("smp/s", ":.0f"),
+        }
+        if torch.cuda.is_available():
+            meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f", reduction="max")
+        processes = {"accelerator": accelerator, "dp_world_size": accelerator.num_processes}  # LeRobot 0.6, its main
+        known = signature(MetricsTracker).parameters
+        self.numbers = MetricsTracker(
+            config.batch_size,
+            dataset.num_frames,
+            dataset.num_episodes,
+            meters,
+            step,
+            **{name: value for name, value in processes.items() if name in known},
+        )
+        self._wandb = None
+        if self._first and config.wandb.enable and config.wandb.project:
+            from lerobot.common.wandb_utils import WandBLogger
+
+            self._wandb = WandBLogger(config)
+        self._file = config.output_dir / LOSSES
+        self._bar = tqdm(
+            total=config.steps, initial=step, desc="Training", unit="step", disable=not self._first or inside_slurm()
+        )
+        if self._first:
+            logger.info("Output dir: %s", config.output_dir)
+            logger.info("%d frames of %d episodes", dataset.num_frames, dataset.num_episodes)
+            self._keep_until(step)
+
+    def note(self, logged: Mapping[str, Any]) -> None:
+        """Add the numbers of an update."""
+        for name in ("loss", "grad_norm", "lr", "update_s"):
+            setattr(self.numbers, name, logged[name])
+        if torch.cuda.is_available():
+            self.numbers.gpu_mem_gb = torch.cuda.max_memory_allocated() / 1024**3
+            torch.cuda.reset_peak_memory_stats()
+        self.numbers.update_metrics(logged)
+        self.numbers.step()
+        self._bar.update(1)
+
+    def write(self, step: int) -> None:
+        """Write the means since the last call, over all processes."""
+        numbers = self.numbers
+        numbers.reduce_across_ranks()
+        seconds = numbers.update_s.avg + numbers.dataloading_s.avg
+        if self._first:
+            if seconds > 0:
+                numbers.samples_per_s = self._batch / seconds
+            logger.info("%s", numbers)
+            self._send(step, numbers.to_dict(), "train")
+        numbers.reset_averages()
+
+    def write_held_out(self, step: int, loss: float) -> None:
+        """Write the mean loss of held-out episodes."""
+        if self._first:
+            logger.info("step %d: eval_loss=%.4f", step, loss)
+            self._send(step, {"eval_loss": loss}, "eval")
+
+    def write_evaluation(self, step: int, found: Mapping[str, Any]) -> None:
+        """Write the rates of rollouts."""
+        for suite, rates in found.items():
+            logger.info("Suite %s aggregated: %s", suite, rates)
+        overall = found["overall"]
+        self._send(step, {name: overall[name] for name in ("avg_sum_reward", "pc_success", "eval_s")}, "eval")
+        if self._wandb is not None and overall.get("video_paths"):
+            self._wandb.log_video(overall["video_paths"][0], step, mode="eval")
+
+    def keep_model(self, checkpoint: Path) -> None:
+        """Send a checkpoint to W&B, if it is enabled."""
+        if self._wandb is not None:
+            self._wandb.log_policy(checkpoint)
+
+    def close(self) -> None:
+        """End the progress bar."""
+        self._bar.close()
+        if self._first:
+            logger.info("End of training")
+
+    def _send(self, step: int, numbers: dict[str, Any], mode: str) -> None:
+        if self._wandb is not None:
+            self._wandb.log_dict(numbers, step, mode=mode)
+        rows = [(step, mode, name, value) for name, value in numbers.items() if isinstance(value, int | float)]
+        with self._file.open("a", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows(rows)
+
+    def _keep_until(self, step: int) -> None:
+        """Remove the rows after the step of a resumed training; create the file if it does not exist."""
+        rows = [["step", "mode", "name", "value"]]
+        if self._file.is_file():
+            with self._file.open(encoding="utf-8", newline="") as before:
+                rows += [row for row in csv.reader(before) if row[0].isdecimal() and int(row[0]) <= step]
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        with self._file.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows(rows)
 
 
 # -- memory on a CPU ---------------------------------------------------------------------------------------------------

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_memobench.datasets.lerobot_format.reading import list_episodes
+from lerobot_memobench.datasets.episodes import list_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import PROMPTED
 from lerobot_memobench.protocol import PROMPT
 
 
-@dataclass
 class FrameSampler:
     """Yield global indices of frames, in an order that depends on seed and epoch alone.
 
@@ -27,29 +25,33 @@ class FrameSampler:
     Without groups and weights the order is that of LeRobot's sampler.
 
     Args:
-        parts: for each episode its frames to draw.
+        episodes: (E + 1,) first frame of each episode, and N. acts: (N,) whether a frame is one to learn from.
+        used: the episodes to draw; None: all.
         together: frames of an episode in a row.
-        tasks: (E,) number of each episode's task, with ``weights``; None: each frame is drawn once per epoch.
-        weights: (T,) weight of each task. An epoch has as many frames as without weights.
-        epoch, offset: start of the next iteration.
+        tasks: result of `task_weights`; None: each frame is drawn once per epoch.
         numbered: whether it yields pairs of a frame and its number among all draws.
     """
 
-    parts: Sequence[np.ndarray]
-    together: int = 1
-    tasks: np.ndarray | None = None
-    weights: np.ndarray | None = None
-    seed: int = 0
-    epoch: int = 0
-    offset: int = 0
-    numbered: bool = False
-
-    def __post_init__(self) -> None:
-        lengths = np.array([len(part) for part in self.parts], dtype=np.int64)
+    def __init__(
+        self,
+        episodes: np.ndarray,
+        acts: np.ndarray,
+        used: Collection[int] | None,
+        *,
+        together: int = 1,
+        tasks: tuple[np.ndarray, np.ndarray] | None = None,
+        seed: int = 0,
+        numbered: bool = False,
+    ) -> None:
+        chosen = range(len(episodes) - 1) if used is None else sorted(used)
+        parts = [episodes[k] + np.flatnonzero(acts[episodes[k] : episodes[k + 1]]) for k in chosen]
+        lengths = np.array([len(part) for part in parts], dtype=np.int64)
         if not lengths.any():
             raise MemobenchError("no episode has an execution frame; name a dataset of `memobench generate`")
-        self.tasks = None if self.tasks is None else self.tasks[lengths > 0]
-        self.frames, self.ends = np.concatenate(self.parts), np.cumsum(lengths[lengths > 0])
+        self.frames, self._ends = np.concatenate(parts), np.cumsum(lengths[lengths > 0])
+        self._tasks = None if tasks is None else (tasks[0][chosen][lengths > 0], tasks[1])
+        self._together, self._seed, self._numbered = together, seed, numbered
+        self.epoch = self.offset = 0  # start of the next iteration
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -58,18 +60,18 @@ class FrameSampler:
         order, first = self.order(self.epoch)[self.offset :], self.epoch * len(self) + self.offset
         self.epoch, self.offset = self.epoch + 1, 0
         frames = self.frames[order.numpy()].tolist()
-        return zip(frames, itertools.count(first)) if self.numbered else iter(frames)
+        return zip(frames, itertools.count(first)) if self._numbered else iter(frames)
 
     def order(self, epoch: int) -> Tensor:
         """Return an epoch's order of the entries of ``frames``."""
-        generator = torch.Generator().manual_seed(seed_of(self.seed, epoch, dtype=np.uint64))
-        if self.tasks is not None and self.weights is not None:
-            return weighted_order(self.ends, self.tasks, self.weights, self.together, generator)
-        if self.together > 1:
-            return grouped_order(self.ends, self.together, generator)
+        generator = torch.Generator().manual_seed(seed_of(self._seed, epoch, dtype=np.uint64))
+        if self._tasks is not None:
+            return weighted_order(self._ends, *self._tasks, self._together, generator)
+        if self._together > 1:
+            return grouped_order(self._ends, self._together, generator)
         return torch.randperm(len(self), generator=generator)
 
-    def go_on(self, step: int, batch_size: int, processes: int) -> None:
+    def resume_from(self, step: int, batch_size: int, processes: int) -> None:
         """Continue after so many updates with a batch size per process."""
         per_epoch = math.ceil(math.ceil(len(self) / batch_size) / processes)  # accelerate pads the last batches
         self.epoch, batches = divmod(step, per_epoch)
@@ -116,29 +118,6 @@ def weighted_order(
     lengths = torch.from_numpy(ends) - first
     offset = (torch.rand(len(episode), generator=generator, dtype=torch.float64) * lengths[episode]).long()
     return (first[episode] + offset)[:count]
-
-
-def frame_sampler(
-    episodes: np.ndarray,
-    acts: np.ndarray,
-    used: Collection[int] | None,
-    *,
-    together: int = 1,
-    tasks: tuple[np.ndarray, np.ndarray] | None = None,
-    seed: int = 0,
-    numbered: bool = False,
-) -> FrameSampler:
-    """Return the sampler of a dataset's frames to learn from.
-
-    Args:
-        episodes: (E + 1,) first frame of each episode, and N. acts: (N,) whether a frame is one of them.
-        used: the episodes to draw; None: all.
-        tasks: result of `task_weights`. numbered: as of `FrameSampler`.
-    """
-    chosen = range(len(episodes) - 1) if used is None else sorted(used)
-    parts = [episodes[k] + np.flatnonzero(acts[episodes[k] : episodes[k + 1]]) for k in chosen]
-    numbers, weights = (None, None) if tasks is None else (tasks[0][chosen], tasks[1])
-    return FrameSampler(parts, together, numbers, weights, seed, numbered=numbered)
 
 
 def task_weights(

@@ -9,12 +9,11 @@ actions and windows of inputs end at a hold.
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -25,36 +24,30 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from lerobot.configs import FeatureType
-from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.utils.constants import OBS_IMAGES
-from lerobot.utils.feature_utils import dataset_to_policy_features
 from PIL import Image, ImageOps
 
-from lerobot_memobench.datasets.demonstration import EARLIER_COLUMNS, LEVEL_COLUMNS
+from lerobot_memobench.datasets.demonstration import LEVEL_COLUMNS
+from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
-from lerobot_memobench.datasets.lerobot_format.columns import LANGUAGE, PRIVILEGED, image_key
-from lerobot_memobench.datasets.lerobot_format.columns import OBJECTS as OBJECTS_COLUMN
-from lerobot_memobench.datasets.lerobot_format.layout import (
+from lerobot_memobench.datasets.layout import (
     EPISODES,
     INFO_FILE,
+    LANGUAGE,
+    PRIVILEGED,
     STATS_FILE,
     TASKS_FILE,
-    without_pattern,
+    image_key,
 )
-from lerobot_memobench.datasets.lerobot_format.tables import read_info, tables_of, undamaged
+from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.statistics import recorded
 from lerobot_memobench.datasets.video import mirror_video, video_info
 from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
-from lerobot_memobench.policies.checkpoint import trained_names
-from lerobot_memobench.policies.compatibility import keeps_sizes
-from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
+from lerobot_memobench.protocol import CAMERAS, CLOCK
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
-from lerobot_memobench.training.configuration import check_environment, with_features
-from lerobot_memobench.training.data import check_dataset_version, check_episodes, complete_statistics
 from lerobot_memobench.training.features import cameras_of
 
 SOURCE_EPISODE = "source_episode_index"
@@ -62,7 +55,7 @@ SOURCE_EPISODE = "source_episode_index"
 
 
 @dataclass(frozen=True)
-class Choice:
+class ViewOptions:
     """The frames and columns of a view.
 
     Attributes:
@@ -119,143 +112,55 @@ class Choice:
         return found != self.convention
 
 
-# -- for a training ----------------------------------------------------------------------------------------------------
-
-
-def viewed(
-    config: TrainPipelineConfig, prompt_frames: bool | None, obs_type: str | None, notify: Callable[[str], None]
-) -> TrainPipelineConfig:
-    """Return the configuration for LeRobot's trainer, with a view of the dataset if it is needed.
-
-    Args:
-        prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
-        obs_type: kind of observation; None: pictures if the dataset has them, else objects.
-        notify: called with the view's folder.
-
-    Raises:
-        MemobenchError: the dataset lacks the observations, or is streamed from the hub.
-    """
-    config = copy.deepcopy(config)
-    given, policy = config.dataset, config.policy
-    if policy is None:
-        return config
-    if given.root is not None:
-        given.root = str(without_pattern(Path(given.root)))
-    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
-    check_dataset_version(meta)
-    check_episodes(given.episodes, meta)
-    choice = choice_for(policy, meta.features, prompt_frames, obs_type)
-    kept = choice.columns(meta.features)
-    features = {new: meta.features[name] for name, new in kept.items()}
-    if policy.pretrained_path is not None and not config.rename_map:
-        names = trained_names(policy.pretrained_path)
-        config.rename_map = {old: new for old, new in names.items() if old in features}
-    check_environment(config, meta, features)
-    check_inputs(policy, meta, features, config.rename_map)
-    sizes = [tuple(features[name]["shape"][:2]) for name in cameras_of(features)]
-    if _is_ours(meta.features) and keeps_sizes(policy) and any(size != (IMAGE_SIZE, IMAGE_SIZE) for size in sizes):
-        height, width = sizes[0]
-        notify(
-            f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "
-            f"them; evaluate it with observation_height={height} observation_width={width}"
-        )
-    if given.streaming and not (Path(meta.root) / "data").is_dir():
-        if needs_view(meta.features, choice):
-            raise MemobenchError(
-                f"dataset.streaming=true reads {given.repo_id} from the hub with its prompts and all of its columns; "
-                "leave dataset.streaming out"
-            )
-        return config
-    complete_statistics(policy, meta, given)
-    if choice.prompts and not policy.input_features and not chooses_inputs(policy):
-        policy.input_features = {  # the view has the clock, which is not an input
-            name: one
-            for name, one in dataset_to_policy_features({new: meta.features[old] for old, new in kept.items()}).items()
-            if one.type is not FeatureType.ACTION and name not in CLOCK
-        }
-    if not needs_view(meta.features, choice):
-        return config
-    root = Path(meta.root)
-    if not (root / "data").is_dir():
-        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
-    folder = cache_folder() / "views" / f"{root.resolve().name}-{view_hash(root, choice)}"
-    if not (folder / INFO_FILE).is_file():
-        write_view(root, folder, choice)
-    notify(f"LeRobot's trainer reads {folder}: {described(choice)}")
-    if given.episodes is not None:
-        sources = LeRobotDatasetMetadata(given.repo_id, root=folder).episodes[SOURCE_EPISODE]
-        given.episodes = [number for number, source in enumerate(sources) if source in given.episodes]
-    given.root = str(folder)
-    return config
-
-
-def check_inputs(policy: Any, meta: Any, features: dict[str, Any], renamed: Mapping[str, str]) -> None:
-    """Refuse inputs that a policy cannot have, such as two cameras of VQ-BeT; LeRobot does after opening the data."""
-    made = with_features(policy, features)
-    read, there = [*made.image_features], {renamed.get(name, name): name for name in cameras_of(features)}
-    missing, free = ([name for name in one if name not in other] for one, other in ((read, there), (there, read)))
-    if missing and free:
-        guess = json.dumps(dict(zip((there[name] for name in free), missing, strict=False)))
-        raise MemobenchError(
-            f"the policy {policy.pretrained_path or policy.type} reads {', '.join(read)}, and {meta.root} has "
-            f"{', '.join(there.values())}; map its names, for example by rename_map='{guess}'"
-        )
-    try:
-        made.validate_features()
-    except ValueError as error:
-        raise MemobenchError(
-            f"policy={policy.type} cannot read {', '.join(made.input_features)} of {meta.root}: {error} Choose its "
-            "inputs by policy.input_features"
-        ) from None
-
-
-def choice_for(policy: Any, features: Mapping[str, Any], prompt_frames: bool | None, obs_type: str | None) -> Choice:
+def view_options(
+    policy: Any, features: Mapping[str, Any], prompt_frames: bool | None, obs_type: str | None
+) -> ViewOptions:
     """Return the frames and inputs that a policy is trained on; a checkpoint keeps its inputs."""
     prompts = reads_prompt(policy) if prompt_frames is None else prompt_frames
     begun = getattr(policy, "input_features", None) or {}
     if chooses_inputs(policy):
-        return Choice(prompts, None)
+        return ViewOptions(prompts, None)
     if begun:
         pictures = any(one.type is FeatureType.VISUAL for one in begun.values())
         objects = OBJECTS_COLUMN in begun
-        seen = {(True, True): BOTH, (True, False): PIXELS, (False, True): OBJECTS}.get((pictures, objects))
-        return Choice(prompts, seen)
-    if obs_type is None:
-        objects = PRIVILEGED in features or OBJECTS_COLUMN in features
-        obs_type = PIXELS if cameras_of(features) else OBJECTS if objects else None
-    return Choice(prompts, obs_type)
+    elif obs_type is not None:
+        return ViewOptions(prompts, obs_type)
+    else:
+        pictures = bool(cameras_of(features))
+        objects = not pictures and (PRIVILEGED in features or OBJECTS_COLUMN in features)
+    seen = {(True, True): BOTH, (True, False): PIXELS, (False, True): OBJECTS}.get((pictures, objects))
+    return ViewOptions(prompts, seen)
 
 
-def _is_ours(features: Mapping[str, Any]) -> bool:
+def has_benchmark_columns(features: Mapping[str, Any]) -> bool:
     """Return whether a dataset is the benchmark's, by its texts too: a phase alone may have another meaning."""
-    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {EARLIER_COLUMNS.get(name, name) for name in features}
+    return {*CLOCK, LEVEL_COLUMNS["intermediate"]} <= {*features}
 
 
-def needs_view(features: Mapping[str, Any], choice: Choice) -> bool:
-    """Return whether a dataset differs from its view."""
-    kept = choice.columns(features)
-    shortened = _is_ours(features) and not choice.prompts
-    return shortened or choice.mirrors(features) or kept != {name: name for name in features}
-
-
-def described(choice: Choice) -> str:
-    """Return a view's content in words."""
-    frames = "all frames" if choice.prompts else "without the frames of prompts and holds"
-    return f"{frames}, {choice.obs_type or 'all observations'}"
+def needs_view(features: Mapping[str, Any], options: ViewOptions) -> bool:
+    """Return whether a dataset differs from its view, in the convention of the dataset."""
+    shortened = has_benchmark_columns(features) and not options.prompts
+    return shortened or options.columns(features) != {name: name for name in features}
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
 
 
-def view_hash(root: Path, choice: Choice) -> str:
-    """Return a hash of a dataset's path, tables and metadata, of the choice, and of the layout of views."""
-    digest = hashlib.blake2b(f"{root.resolve()} {choice} {SOURCE_EPISODE}".encode(), digest_size=8)
+def cached_view(root: Path, options: ViewOptions) -> Path:
+    """Return the view of a dataset in the cache folder; write it first if it is not there.
+
+    Its name has a hash of the options, and of the dataset's path, tables and metadata.
+    """
+    digest = hashlib.blake2b(f"{root.resolve()} {options} {SOURCE_EPISODE}".encode(), digest_size=8)
     for path in (*files_below(root / "meta"), *files_below(root / "data", ".parquet")):
         digest.update(path.read_bytes())
-    return digest.hexdigest()
+    folder = cache_folder() / "views" / f"{root.resolve().name}-{digest.hexdigest()}"
+    if not (folder / INFO_FILE).is_file():
+        write_view(root, folder, options)
+    return folder
 
 
-def write_view(root: Path, out: Path, choice: Choice) -> None:
+def write_view(root: Path, out: Path, options: ViewOptions) -> None:
     """Write a view of the dataset in ``root``.
 
     Raises:
@@ -264,39 +169,44 @@ def write_view(root: Path, out: Path, choice: Choice) -> None:
     if out.exists():
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
-    kept, mirrors = choice.columns(info["features"]), choice.mirrors(info["features"])
-    part = Part.of(table, _is_ours(info["features"]) and not choice.prompts)
-    if not part.starts.size:
+    features, fps = info["features"], info["fps"]
+    kept, mirrors, is_ours = options.columns(features), options.mirrors(features), has_benchmark_columns(features)
+    stretches = Stretches.of(table, is_ours and not options.prompts)
+    if not stretches.starts.size:
         raise MemobenchError(f"{root} has no frame whose action has an effect; name a dataset of `memobench generate`")
     build = out.with_name(f".{out.name}.{os.getpid()}")
     with explaining_disk_errors(out):
         shutil.rmtree(build, ignore_errors=True)
         for path, rows in tables_of(root / "data"):
             with undamaged(path):
-                frames = _frames_of(rows, kept, part, info["fps"])
+                frames = _frames_of(rows, kept, stretches, fps)
                 frames = _mirrored(frames) if mirrors else frames
             _write_table(frames, build / path.relative_to(root))
         for path, rows in tables_of(root / EPISODES):
-            _write_table(_episodes_of(rows, kept, part, info["fps"]), build / path.relative_to(root))
-        features = {new: info["features"][name] for name, new in kept.items()}
-        for name in cameras_of(info["features"]):
+            _write_table(_episodes_of(rows, kept, stretches, fps), build / path.relative_to(root))
+        described = {new: features[name] for name, new in kept.items()}
+        stated = options.convention if options.convention == MIRRORED or not is_ours else None
+        for name in cameras_of(features):
             if name in kept:
-                _write_videos(root, build, name, kept[name], info["fps"] if mirrors else None)
-        for name in cameras_of(features) if mirrors else ():
-            stated = choice.convention if choice.convention == MIRRORED or not _is_ours(info["features"]) else None
-            features[name] = _described(features[name], build / "videos" / name, stated)
-        count = len(part.starts)
-        info |= {"features": features, "total_episodes": count, "total_frames": int(part.lengths.sum())}
+                videos = build / "videos" / kept[name]
+                _write_videos(root / "videos" / name, videos, fps if mirrors else None)
+                if mirrors:
+                    new = {key: one for key, one in features[name].items() if key not in ("convention", "info")}
+                    new |= {"convention": stated} if stated else {}
+                    new |= {"info": video_info(files[0])} if (files := files_below(videos, ".mp4")) else {}
+                    described[kept[name]] = new
+        count = len(stretches.starts)
+        info |= {"features": described, "total_episodes": count, "total_frames": int(stretches.lengths.sum())}
         info["splits"] = {"train": f"0:{count}"}
         write_file(build / INFO_FILE, json.dumps(info, indent=4))
-        stats = recorded(root)
-        write_file(build / STATS_FILE, json.dumps({kept[name]: one for name, one in stats.items() if name in kept}))
+        stats = {kept[name]: one for name, one in recorded(root).items() if name in kept}
+        write_file(build / STATS_FILE, json.dumps(stats))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
         build.rename(out)
 
 
-class Part(NamedTuple):
-    """The frames of a view: S stretches of a dataset's E episodes, each of which is an episode of the view.
+class Stretches(NamedTuple):
+    """The S stretches of a dataset's episodes that are the episodes of a view.
 
     Attributes:
         starts: (S,) first frame of each stretch in the dataset. lengths: (S,) number of its frames.
@@ -311,7 +221,7 @@ class Part(NamedTuple):
     offsets: np.ndarray
 
     @classmethod
-    def of(cls, table: FrameTable, shortened: bool) -> Part:
+    def of(cls, table: FrameTable, shortened: bool) -> Stretches:
         """Return all episodes, or if ``shortened`` the stretches of frames whose action has an effect."""
         acts = table.acts if shortened else np.ones(len(table.phase), np.bool_)
         edges = table.runs(acts)
@@ -321,23 +231,34 @@ class Part(NamedTuple):
         return cls(starts, lengths, np.cumsum(lengths) - lengths, sources, starts - table.episodes[sources])
 
 
-def _frames_of(rows: pa.Table, kept: Mapping[str, str], part: Part, fps: float) -> pa.Table:
+def _frames_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
     """Return the view's rows and columns of a data file, with new numbers."""
     index = rows.column("index").to_numpy()
-    stretch = np.searchsorted(part.starts, index, "right") - 1
-    wanted = (stretch >= 0) & (index < (part.starts + part.lengths)[stretch])
-    rows, index, stretch = rows.filter(pa.array(wanted)).replace_schema_metadata(None), index[wanted], stretch[wanted]
-    within = index - part.starts[stretch]
-    numbers = {"index": part.firsts[stretch] + within, "episode_index": stretch, "frame_index": within}
-    numbers["timestamp"] = (within / fps).astype(np.float32)
-    for name, values in numbers.items():
-        place = rows.column_names.index(name)
-        rows = rows.set_column(place, name, pa.array(values, rows.schema.field(name).type))
+    number = np.searchsorted(stretches.starts, index, "right") - 1
+    wanted = (number >= 0) & (index < (stretches.starts + stretches.lengths)[number])
+    rows, index, number = rows.filter(pa.array(wanted)).replace_schema_metadata(None), index[wanted], number[wanted]
+    within = index - stretches.starts[number]
+    rows = _with_values(
+        rows,
+        {
+            "index": stretches.firsts[number] + within,
+            "episode_index": number,
+            "frame_index": within,
+            "timestamp": (within / fps).astype(np.float32),
+        },
+    )
     if LANGUAGE in rows.column_names:
-        place, seconds = rows.column_names.index(LANGUAGE), part.offsets[stretch] / fps
-        rows = rows.set_column(place, LANGUAGE, _earlier(rows.column(LANGUAGE).combine_chunks(), seconds))
+        texts = _earlier(rows.column(LANGUAGE).combine_chunks(), stretches.offsets[number] / fps)
+        rows = rows.set_column(rows.column_names.index(LANGUAGE), LANGUAGE, texts)
     there = [name for name in rows.column_names if name in kept]
     return rows.select(there).rename_columns([kept[name] for name in there])
+
+
+def _with_values(rows: pa.Table, changed: Mapping[str, np.ndarray]) -> pa.Table:
+    """Return rows with other values of columns, in the columns' types."""
+    for name, values in changed.items():
+        rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
+    return rows
 
 
 def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
@@ -351,7 +272,7 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
 
 
 def _mirrored(frames: pa.Table) -> pa.Table:
-    """Return frames with LeRobot's images in them mirrored left to right, as PNG."""
+    """Return frames with LeRobot's images mirrored left to right, as PNG."""
     for place, field in enumerate(frames.schema):
         if field.name.startswith(OBS_IMAGES) and pa.types.is_struct(field.type):
             rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(place).to_pylist()]
@@ -365,46 +286,40 @@ def _mirrored_image(content: bytes) -> bytes:
         return file.getvalue()
 
 
-def _write_videos(root: Path, build: Path, name: str, new: str, mirrored_at: int | None) -> None:
-    """Write a camera's videos: links to the dataset's, or mirrored at so many frames/s."""
-    for path in files_below(root / "videos" / name, ".mp4"):
-        place = build / "videos" / new / path.relative_to(root / "videos" / name)
-        if mirrored_at is None:
-            _link(path.resolve(), place)
-        else:
-            place.parent.mkdir(parents=True, exist_ok=True)
+def _write_videos(source: Path, out: Path, mirrored_at: int | None) -> None:
+    """Write a camera's videos: links to the dataset's, copies without support of links, or mirrored ones (frames/s)."""
+    for path in files_below(source, ".mp4"):
+        place = out / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if mirrored_at is not None:
             with undamaged(path):
                 mirror_video(path, place, mirrored_at)
+            continue
+        try:
+            place.symlink_to(path.resolve())
+        except OSError:
+            shutil.copyfile(path, place)
 
 
-def _described(feature: dict[str, Any], videos: Path, stated: str | None) -> dict[str, Any]:
-    """Return LeRobot's description of a camera's mirrored pictures, which states their convention where needed."""
-    found = {key: one for key, one in feature.items() if key not in ("convention", "info")}
-    files = files_below(videos, ".mp4")
-    return found | ({"convention": stated} if stated else {}) | ({"info": video_info(files[0])} if files else {})
-
-
-def _episodes_of(rows: pa.Table, kept: Mapping[str, str], part: Part, fps: float) -> pa.Table:
+def _episodes_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
     """Return the view's rows of a file of the episodes' table: numbers, bounds of frames, and times in the videos."""
     numbers = rows.column("episode_index").to_numpy()
-    stretches = np.flatnonzero(np.isin(part.sources, numbers))
-    rows = rows.take(pa.array(np.searchsorted(numbers, part.sources[stretches])))  # they are in the order of numbers
-    firsts, lengths = part.firsts[stretches], part.lengths[stretches]
+    chosen = np.flatnonzero(np.isin(stretches.sources, numbers))
+    rows = rows.take(pa.array(np.searchsorted(numbers, stretches.sources[chosen])))  # they are in the order of numbers
+    firsts, lengths = stretches.firsts[chosen], stretches.lengths[chosen]
     changed = {
-        "episode_index": stretches,
+        "episode_index": chosen,
         "dataset_from_index": firsts,
         "dataset_to_index": firsts + lengths,
         "length": lengths,
     }
     for name in rows.column_names:
         if name.endswith("/from_timestamp"):
-            changed[name] = rows.column(name).to_numpy() + part.offsets[stretches] / fps
+            changed[name] = rows.column(name).to_numpy() + stretches.offsets[chosen] / fps
             changed[name.replace("/from_", "/to_")] = changed[name] + lengths / fps
-    rows = rows.select([name for name in rows.column_names if name != SOURCE_EPISODE])  # a view of a view has it
-    rows = rows.append_column(SOURCE_EPISODE, rows.column("episode_index"))
-    for name, values in changed.items():
-        rows = rows.set_column(rows.column_names.index(name), name, pa.array(values, rows.schema.field(name).type))
-    rows = rows.select([name for name in rows.column_names if not name.startswith("stats/")])
+    names = [name for name in rows.column_names if not name.startswith("stats/")]
+    rows = rows.select([name for name in names if name != SOURCE_EPISODE])  # a view of a view has it
+    rows = _with_values(rows.append_column(SOURCE_EPISODE, rows.column("episode_index")), changed)
     parts = [name.split("/") for name in rows.column_names]  # videos/<camera>/<place>
     names = ["/".join(kept.get(one, one) if at == 1 else one for at, one in enumerate(each)) for each in parts]
     return rows.rename_columns(names).replace_schema_metadata(None)
@@ -413,12 +328,3 @@ def _episodes_of(rows: pa.Table, kept: Mapping[str, str], part: Part, fps: float
 def _write_table(table: pa.Table, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path)
-
-
-def _link(path: Path, place: Path) -> None:
-    """Link to a file, or copy it if links are not supported."""
-    place.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        place.symlink_to(path)
-    except OSError:
-        shutil.copyfile(path, place)

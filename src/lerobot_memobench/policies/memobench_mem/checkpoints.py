@@ -6,7 +6,6 @@ The model file holds the averaged weights; `training.average` saves the trained 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,21 +29,20 @@ from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 logger = logging.getLogger(__name__)
 
+_HEAD = "paligemma_with_expert.paligemma.lm_head.weight"
+_EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+
 
 def read_config(source: str | Path, config: PreTrainedConfig | None, revision: str | None) -> MemobenchMemConfig:
-    """Return the configuration to load a checkpoint with: ``config``, or the checkpoint's own.
-
-    Raises:
-        MemobenchError: the checkpoint is another policy's, or its processors name code.
-    """
+    """Return the configuration to load a checkpoint with: ``config``, or the checkpoint's own."""
     check_processors(source, revision)
-    found = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
-    if not isinstance(found, MemobenchMemConfig):
+    loaded = PreTrainedConfig.from_pretrained(source, revision=revision) if config is None else config
+    if not isinstance(loaded, MemobenchMemConfig):
         raise MemobenchError(
-            f"'{source}' is a '{found.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
+            f"'{source}' is a '{loaded.type}' checkpoint and not memobench_mem; to start from pi0.5's weights "
             "pass --policy.type=memobench_mem --policy.base_weights=<checkpoint>."
         )
-    return found
+    return loaded
 
 
 def has_another_memory(config: MemobenchMemConfig, trained: MemobenchMemConfig) -> bool:
@@ -61,10 +59,7 @@ def restarted(policy: nn.Module, trained: MemobenchMemConfig) -> set[str]:
     """Return the names of the policy's tensors that keep their initial weights instead of a checkpoint's.
 
     These are the memory and its fusion if the memory differs, and the alignment head if the memory, the objective or
-    the text encoder differs.
-
-    Args:
-        trained: the checkpoint's configuration.
+    the text encoder differs. ``trained`` is the checkpoint's configuration.
     """
     config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
     if has_another_memory(config, trained):
@@ -77,14 +72,7 @@ def _head(policy: nn.Module) -> set[str]:
 
 
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
-    """Load the weights of checkpoint ``source`` into a policy of this kind.
-
-    Args:
-        trained: the checkpoint's configuration. `restarted` parts keep their initial weights, with a warning.
-
-    Raises:
-        MemobenchError: the weights cannot be read, or do not fit.
-    """
+    """Load the weights of checkpoint ``source``; `restarted` parts keep their initial weights, with a warning."""
     config, new = cast(MemobenchMemConfig, policy.config), restarted(policy, trained)
     for name, asked, held in differing(config, trained, ("base_weights", "visual_encoder")):
         raise MemobenchError(
@@ -108,52 +96,44 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
 
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
     """Load pi0.5's weights; the memory's parameters keep their initial values."""
-    placed = {name.removeprefix("model."): tensor for name, tensor in weights.items()}
+    # As LeRobot's pi0.5: openpi's checkpoints have older names, and store the embedding as the language head only.
+    placed = {name.removeprefix("model.").replace("action_time_mlp", "time_mlp"): one for name, one in weights.items()}
+    if _HEAD in placed:
+        placed.setdefault(_EMBEDDING, placed[_HEAD])
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
 
 
 # -- files ------------------------------------------------------------------------------------------------------------
 
 
-def weights_file(source: str | Path, revision: str | None = None, *, named: str, fix: str) -> Path:
+def weights_file(source: str | Path, revision: str | None = None) -> Path:
     """Return the file of a checkpoint's weights.
-
-    Args:
-        named, fix: how the error message refers to the checkpoint, and its advice.
 
     Raises:
         MemobenchError: the checkpoint has no weights.
     """
     path = checkpoint_file(source, WEIGHTS_FILE, revision)
     if path is None:
-        raise MemobenchError(f"{named} has no {WEIGHTS_FILE}; {fix}.")
+        raise MemobenchError(f"The checkpoint '{source}' has no {WEIGHTS_FILE}; give a pretrained_model folder.")
     return path
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
-    """Return all tensors of a file.
-
-    Raises:
-        MemobenchError: the file is truncated or damaged.
-    """
+    """Return all tensors of a file; a `MemobenchError` if it is truncated or damaged."""
     with undamaged(path):
         return load_file(path)
 
 
 def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
-    """Return the weights whose names start with ``prefix``, without a leading ``model.`` and the prefix.
-
-    Raises:
-        MemobenchError: the weights are missing or cannot be read.
-    """
-    path = weights_file(source, named=f"'{source}'", fix="give the folder or repository of a pi0.5 checkpoint")
+    """Return the weights whose names start with ``prefix``, without a leading ``model.`` and the prefix."""
+    path = weights_file(source)
     with undamaged(path), safe_open(path, framework="pt") as tensors:
-        found = {}
+        weights = {}
         for name in tensors.keys():  # noqa: SIM118 (not a dict)
             short = name.removeprefix("model.")
             if short.startswith(prefix):
-                found[short.removeprefix(prefix)] = tensors.get_tensor(name)
-    return found
+                weights[short.removeprefix(prefix)] = tensors.get_tensor(name)
+    return weights
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:
@@ -178,13 +158,10 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Pa
 # -- saved processor steps --------------------------------------------------------------------------------------------
 
 
-_ORACLE = "memobench_oracle_memory"
-
-
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
     """Check that the saved processor steps of a checkpoint agree with ``config``.
 
-    Training updates our steps (`follow_training`) and some of LeRobot's; the others keep the checkpoint's settings. A
+    Training updates most steps (`follow_training`); a pretrained tokenizer keeps the checkpoint's settings. A
     checkpoint without a preprocessor passes this check; LeRobot reports it.
 
     Raises:
@@ -194,28 +171,17 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     if path is None:
         return
     steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in steps_of(path)}
-    for field, held in _held(steps, config, training):
-        asked = getattr(config, field)
-        if asked != held:
-            raise MemobenchError(
-                f"--policy.{field}={asked} has no effect: the preprocessor of '{source}' was saved with {held}, which "
-                f"cannot be changed; leave {field} out, or train from --policy.base_weights."
-            )
-
-
-def _held(
-    steps: Mapping[str, Mapping[str, Any]], config: MemobenchMemConfig, training: bool
-) -> Iterator[tuple[str, object]]:
-    """Yield the settings that saved steps keep, with their values."""
-    if not training or _ORACLE not in steps:
-        yield "oracle_memory", _ORACLE in steps and bool(steps[_ORACLE].get("enabled", True))
+    tokenizer, held = steps.get("memobench_tokenizer"), dict[str, Any]()
     if not training:
-        return
-    tokenizer = steps.get("memobench_tokenizer", steps.get("tokenizer_processor"))  # ours, or LeRobot's pi05
-    words = "memobench_word_tokenizer" in steps
-    if tokenizer is not None or words:
-        yield "tokenizer_name", "words" if tokenizer is None else tokenizer.get("tokenizer_name")
-    if tokenizer is not None:
-        yield "tokenizer_max_length", tokenizer.get("max_length")
-    if not config.use_relative_actions:  # LeRobot can switch them on, but not off
-        yield "use_relative_actions", bool(steps.get("relative_actions_processor", {}).get("enabled", False))
+        held["oracle_memory"] = steps.get("memobench_oracle_memory", {}).get("enabled", False)
+    elif tokenizer is None:
+        held["tokenizer_name"] = "words"
+    else:
+        held["tokenizer_name"] = tokenizer.get("tokenizer_name")
+        held["tokenizer_max_length"] = tokenizer.get("max_length")
+    for field, value in held.items():
+        if getattr(config, field) != value:
+            raise MemobenchError(
+                f"--policy.{field}={getattr(config, field)} has no effect: the preprocessor of '{source}' was saved "
+                f"with {value}, which cannot be changed; leave {field} out, or train from --policy.base_weights."
+            )

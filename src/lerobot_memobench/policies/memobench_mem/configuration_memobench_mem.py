@@ -1,4 +1,4 @@
-"""Configuration of ``memobench_mem``: the settings, their defaults and checks. Dimensions are in `sizes`."""
+"""Configuration of ``memobench_mem``: settings with their defaults and checks, optimizer and schedule."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields
-from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature, PreTrainedConfig
-from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
+from lerobot.optim import AdamWConfig, LRSchedulerConfig, OptimizerConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from torch import nn
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
-from lerobot_memobench.datasets.lerobot_format.columns import PRIVILEGED
+from lerobot_memobench.datasets.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.perception.weights import PACKAGE
-from lerobot_memobench.policies.checkpoint import CONFIG_FILE
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -31,7 +32,6 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     settings_of_another,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
-from lerobot_memobench.policies.memobench_mem.optimization import FusedAdamWConfig, WarmupFractionSchedulerConfig
 from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING, REGRESSION, SIZES, Dimensions
 from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
@@ -54,39 +54,27 @@ ORACLE_TOKENS = 128
 """Tokens added to the prompt's length for oracle memory text: six checkpoints of about ten words."""
 MAY_DIFFER = frozenset(
     (
-        *("n_action_steps", "device", "dtype", "detector", "num_inference_steps", "rtc_config", "use_amp"),
-        *("compile_model", "compile_mode", "gradient_checkpointing", "pretrained_path", "pretrained_revision"),
-        *("use_peft", "output_features", "push_to_hub", "repo_id", "private", "tags", "license"),
+        *("n_action_steps", "device", "dtype", "detector", "num_inference_steps", "use_amp", "use_peft"),
+        *("gradient_checkpointing", "pretrained_path", "pretrained_revision", "output_features"),
+        *("push_to_hub", "repo_id", "private", "tags", "license"),
     )
 )
 """Fields that may have another value than in training when a checkpoint acts or its training is resumed. All others
 are refused then. LeRobot sets ``output_features`` from the environment; `policies.compatibility` checks them."""
-PI05_ALONE = (
-    *("use_visual_memory", "use_proprioceptive_memory", "memory_frames", "memory_temporal_attention_every"),
-    "rtc_training_max_delay",
-)
-"""Fields that LeRobot's main branch adds to pi0.5: visual memory, and training for real-time chunking. They are not
-saved, so that both versions of LeRobot load a checkpoint."""
 
 
 # -- metadata of fields ------------------------------------------------------------------------------------------------
 
 
 class Condition(NamedTuple):
-    """A condition under which some fields are used; otherwise each of them must have its default.
-
-    Attributes:
-        name: of the feature that reads the fields, for error messages. holds: whether a configuration has it.
-    """
+    """A condition under which some fields are used, named by the feature that reads them, for error messages."""
 
     name: str
     holds: Callable[[MemobenchMemConfig], bool]
 
 
 OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
-PIXELS = Condition("perception=pixels", lambda it: not it.uses_objects)
 PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
-IMAGE_TOWER = Condition("pi0.5's image tower", lambda it: not (it.uses_objects or it.uses_visual_encoder))
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
 STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
 MEMORY = Condition("a memory", lambda it: it.memory != NONE)
@@ -100,21 +88,6 @@ TEXTS = Condition(
     "an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory
 )
 FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
-RELATIVE_ACTIONS = Condition("use_relative_actions=true", lambda it: it.use_relative_actions)
-COMPILED = Condition("compile_model=true", lambda it: it.compile_model)
-PLAIN_PI05 = Condition("policy=pi05", lambda _: False)
-
-INHERITED_CONDITIONS: Mapping[str, Condition] = {
-    "empty_cameras": PIXELS,
-    "max_state_dim": STATE_TOKEN,
-    **dict.fromkeys(("rtc_config", "time_sampling_beta_alpha", "time_sampling_beta_beta"), FLOW),
-    **dict.fromkeys(("time_sampling_scale", "time_sampling_offset"), FLOW),
-    "relative_exclude_joints": RELATIVE_ACTIONS,
-    "compile_mode": COMPILED,
-    **dict.fromkeys(("paligemma_variant", "action_expert_variant", "n_obs_steps", *PI05_ALONE), PLAIN_PI05),
-    **dict.fromkeys(("scheduler_warmup_steps", "scheduler_decay_steps", "scheduler_decay_lr"), PLAIN_PI05),
-}
-"""LeRobot's fields that are not always used -> their conditions."""
 
 
 def setting(
@@ -125,13 +98,9 @@ def setting(
     least: float = -math.inf,
     most: float = math.inf,
 ) -> Any:
-    """Return a field of `MemobenchMemConfig`.
+    """Return a field of `MemobenchMemConfig`; without its condition ``used_if`` it has no effect.
 
-    Args:
-        default: its default, or ``dict`` for an empty one.
-        used_if: the condition without which the field has no effect; None: it is always used.
-        values: accepted values; empty for any value of the type.
-        least, most: accepted range.
+    The default may be ``dict``, for an empty one. No ``values`` stand for any value of the type.
     """
     metadata = {"used_if": used_if, "values": tuple(values), "least": least, "most": most}
     kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
@@ -139,11 +108,7 @@ def setting(
 
 
 class UnreadError(MemobenchError):
-    """A field without effect differs from its default.
-
-    Attributes:
-        defaults: field without effect -> its default.
-    """
+    """A field without effect differs from its default; ``defaults`` maps all such fields to their defaults."""
 
     def __init__(self, sentence: str, defaults: Mapping[str, Any]) -> None:
         super().__init__(sentence)
@@ -154,10 +119,52 @@ FROM_SIZE: Any = None
 """Default of a field whose value depends on the size, the perception or the memory; construction sets it."""
 
 
+# -- optimizer and schedule -------------------------------------------------------------------------------------------
+
+
+@OptimizerConfig.register_subclass("memobench_adamw")
+@dataclass
+class FusedAdamWConfig(AdamWConfig):
+    """Fused AdamW. Torch's default takes three times as long on a CPU, and copies the parameters on a GPU.
+
+    At full size the copy takes 10.5 GiB; with it, `config=train_paper` does not fit on four GPUs of 80 GB.
+    """
+
+    def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
+        """Return the optimizer of these parameters."""
+        learning = list(params)
+        fused = all(parameter.device.type in ("cpu", "cuda") for parameter in learning) or None  # None: torch's choice
+        return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
+
+
+@LRSchedulerConfig.register_subclass("memobench_constant_with_warmup")
+@dataclass
+class WarmupFractionSchedulerConfig(LRSchedulerConfig):
+    """Linear warm-up over a fraction of the updates (paper: 5 %), then constant, or a cosine down to ``final``.
+
+    LeRobot's constant schedule takes a number of warm-up steps, which would have to change with ``--steps``.
+    """
+
+    num_warmup_steps: int | None = None
+    warmup_fraction: float = 0.05
+    final: float = 1.0
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """Return the schedule of a training of ``num_training_steps`` updates."""
+        steps = self.num_warmup_steps
+        warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
+
+        def rate(step: int) -> float:
+            fallen = (1 - math.cos(math.pi * min(1.0, step / num_training_steps))) / 2
+            return min(1.0, (step + 1) / warmup) * (1 - (1 - self.final) * fallen)
+
+        return LambdaLR(optimizer, rate)
+
+
 @PreTrainedConfig.register_subclass("memobench_mem")
 @dataclass
-class MemobenchMemConfig(PI05Config):
-    """The fields of LeRobot's pi0.5, and those of the memory. Construction replaces None by a default of the size."""
+class MemobenchMemConfig(PreTrainedConfig):
+    """pi0.5 with a memory. Construction replaces None by a default of the size."""
 
     reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
@@ -181,8 +188,30 @@ class MemobenchMemConfig(PI05Config):
     object_classes: list[str] | None = setting(None, used_if=OBJECTS)
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
+    n_obs_steps: int = setting(1, least=1, most=1)
+    max_state_dim: int = setting(32, used_if=STATE_TOKEN)
+    """Numbers of a state, padded; raised to the dataset's, unless weights are loaded."""
+
+    # -- network
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); None: from scratch."""
+    dtype: str = setting("float32", values=("float32", "bfloat16"))
+    """Precision of LeRobot's transformers: ``float32`` or ``bfloat16``."""
+    tokenizer_name: str | None = None
+    """``words``, or a Hugging Face tokenizer; None: that of the size."""
+    tokenizer_max_length: int | None = None
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
+
+    # -- actions
+    chunk_size: int = FROM_SIZE
+    """Actions of a chunk; None: 16 at ``small``, else 50."""
+    n_action_steps: int = setting(FROM_SIZE, least=1)
+    """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
+    executes the chunk's following actions if its hand has stalled (`rollout.EnvMemory.begin_chunk`)."""
+    max_action_dim: int = 32
+    """Numbers of an action, padded; raised to the dataset's, unless weights are loaded."""
+    num_inference_steps: int = setting(10, used_if=FLOW, least=1)
+    """Steps from noise to actions, with flow matching."""
 
     # -- alignment
     align: str = setting("none", values=ALIGN_WEIGHTS)
@@ -220,9 +249,6 @@ class MemobenchMemConfig(PI05Config):
     memory_phase: bool = setting(False, used_if=OBJECT_MEMORY)
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
-    memory_repeats: bool = setting(True, used_if=OBJECT_MEMORY)
-    """Whether a frame equal to the last remembered one is remembered too. If false, the holds of strict tasks do not
-    fill the memory, and do not use up the frames that a chunk reads."""
 
     # -- training
     objective: str = setting(FROM_SIZE, values=OBJECTIVES)
@@ -242,22 +268,15 @@ class MemobenchMemConfig(PI05Config):
     """Share of the updates in which the learning rate rises. It then stays constant, or falls as a cosine to 0.02 of
     its maximum at ``size=small``."""
 
-    # -- pi0.5's fields with other defaults or checks
-    freeze_vision_encoder: bool = setting(True, used_if=PLAIN_PI05)
-    """Always true: memory tokens are cached features of the image tower."""
-    chunk_size: int = FROM_SIZE
-    """Actions of a chunk; None: 16 at ``small``, else 50."""
-    n_action_steps: int = setting(FROM_SIZE, least=1)
-    """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
-    executes the chunk's following actions if its hand has stalled (`rollout.Row.begin_chunk`)."""
-    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=dict)
-    num_inference_steps: int = setting(10, used_if=FLOW, least=1)
-    """Steps from noise to actions, with flow matching."""
-    image_resolution: tuple[int, int] | None = setting(None, used_if=IMAGE_TOWER)
-    tokenizer_name: str | None = None
-    tokenizer_max_length: int | None = None
+    train_expert_only: bool = False
+    """Train the memory and the action expert, and freeze the language model."""
+    gradient_checkpointing: bool = False
+    """Recompute activations in the backward pass, to save memory."""
     optimizer_lr: float | None = None
+    """Highest learning rate; None: that of the size."""
     optimizer_weight_decay: float = FROM_SIZE
+    optimizer_betas: tuple[float, float] = (0.9, 0.95)
+    optimizer_grad_clip_norm: float = 1.0
 
     def __post_init__(self) -> None:
         try:
@@ -266,14 +285,6 @@ class MemobenchMemConfig(PI05Config):
             # LeRobot's parser reports only that the class "couldn't be instantiated".
             logger.warning("%s", error)
             raise
-
-    def _save_pretrained(self, save_directory: Path) -> None:
-        super()._save_pretrained(save_directory)
-        file = save_directory / CONFIG_FILE
-        saved = json.loads(file.read_text(encoding="utf-8"))
-        if set(PI05_ALONE) & set(saved):  # an earlier LeRobot would refuse the checkpoint for them
-            kept = {name: value for name, value in saved.items() if name not in PI05_ALONE}
-            file.write_text(json.dumps(kept, indent=4), encoding="utf-8")
 
     def _complete(self) -> None:
         """Set the fields that the size and the perception decide, and check every field."""
@@ -293,15 +304,14 @@ class MemobenchMemConfig(PI05Config):
         self._check_read(defaults)
         if self.objective == REGRESSION:
             self.num_inference_steps = 1
-        self._check_numbers()  # before LeRobot's main, whose pi0.5 has a memory_stride too
+        self._check_numbers()
         super().__post_init__()
-        self._check_image_resolution()
         self._check_alignment()
 
     def _defaults(self) -> dict[str, Any]:
         """Return the defaults that depend on the size, the perception and the memory."""
         dims = self.dimensions
-        side, mode = SIDE if self.uses_visual_encoder else dims.vision.image, NormalizationMode(dims.normalization)
+        mode = NormalizationMode(dims.normalization)
         planned = self.chunk_size or dims.defaults["chunk_size"]
         room = ORACLE_TOKENS if self.oracle_memory and dims.tokenizer == "words" else 0
         return {
@@ -314,15 +324,9 @@ class MemobenchMemConfig(PI05Config):
             "tokenizer_max_length": dims.tokenizer_max_length + room,
             "text_encoder": dims.text_encoder,
             "normalization_mapping": {"VISUAL": NormalizationMode.IDENTITY, "STATE": mode, "ACTION": mode},
-            "image_resolution": (side, side),
         }
 
     def _check_read(self, defaults: Mapping[str, Any]) -> None:
-        """Refuse a field without effect, unless it has its default.
-
-        Args:
-            defaults: those of `_defaults`.
-        """
         unset = {
             one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
         }
@@ -336,9 +340,7 @@ class MemobenchMemConfig(PI05Config):
         unread: dict[str, Condition] = {}
         for name, condition in conditions(self).items():
             known = [unset[name], defaults.get(name), *usual.get(name, ())]
-            value = getattr(self, name)
-            value = tuple(value) if isinstance(value, list) and tuple(value) in known else value
-            if value not in known and not condition.holds(self):
+            if getattr(self, name) not in known and not condition.holds(self):
                 unread[name] = condition
         for name, condition in unread.items():
             raise UnreadError(
@@ -350,7 +352,6 @@ class MemobenchMemConfig(PI05Config):
             self.memory_fusion = None
 
     def _complete_memory(self) -> None:
-        """Complete the settings of the memory, and check them."""
         if self.memory == NONE:
             if self.memory_settings in [asdict(read_settings(one, {})) for one in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
@@ -392,16 +393,13 @@ class MemobenchMemConfig(PI05Config):
                     f"--policy.{one.name}={getattr(self, one.name)} is out of range; expected at least {least}"
                     + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
                 )
+        if self.n_action_steps > self.chunk_size:
+            raise MemobenchError(
+                f"--policy.n_action_steps={self.n_action_steps} is more than the {self.chunk_size} actions of a chunk "
+                "(policy.chunk_size)."
+            )
         if any(weight < 0 for weight in (self.task_weights or {}).values()):
             raise MemobenchError(f"--policy.task_weights={self.task_weights} must not hold negative weights.")
-
-    def _check_image_resolution(self) -> None:
-        multiple = MEMORY_GRID * self.dimensions.vision.patch
-        if not self.uses_visual_encoder and any(side % multiple for side in self.image_size):
-            raise MemobenchError(
-                f"--policy.image_resolution={self.image_resolution} must be a multiple of {multiple} pixels at "
-                f"size {self.size}, so that its patches pool to a {MEMORY_GRID}x{MEMORY_GRID} grid."
-            )
 
     def _check_alignment(self) -> None:
         if self.align == NONE:
@@ -427,10 +425,11 @@ class MemobenchMemConfig(PI05Config):
 
     @property
     def fixed_by_training(self) -> tuple[str, ...]:
-        """Fields that must keep their values when a checkpoint acts or its training is resumed, ours first."""
-        ours = [*MemobenchMemConfig.__annotations__]
+        """Fields that must keep their values when a checkpoint acts or its training is resumed."""
+        # Ours first, because another setting is the cause of other inputs.
+        inherited = [one.name for one in fields(PreTrainedConfig)]
         names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
-        return tuple(sorted(names, key=lambda name: ours.index(name) if name in ours else len(ours)))
+        return tuple(sorted(names, key=inherited.__contains__))
 
     @property
     def dimensions(self) -> Dimensions:
@@ -476,9 +475,9 @@ class MemobenchMemConfig(PI05Config):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width of the policy's images, pixels."""
-        assert self.image_resolution is not None
-        return tuple(self.image_resolution)  # type: ignore[return-value]  # a checkpoint gives a list
+        """Height and width to which pictures are resized, pixels."""
+        side = SIDE if self.uses_visual_encoder else self.dimensions.vision.image
+        return side, side
 
     @property
     def tokens_per_frame(self) -> int:
@@ -495,12 +494,16 @@ class MemobenchMemConfig(PI05Config):
         """Whether small grey copies of pictures are remembered instead of their tokens."""
         return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
 
-    def check_memory_reads(self) -> None:
-        """Check that the memory's fusion can report how much a chunk reads of each remembered entry.
+    @property
+    def skips_repeated_frames(self) -> bool:
+        """Whether a frame equal to the last remembered one is not remembered.
 
-        Raises:
-            MemobenchError: there is no memory, or its own fusion has no attention weights.
+        The holds of strict tasks would fill a memory of objects and use up the frames that a chunk reads.
         """
+        return OBJECT_MEMORY.holds(self)
+
+    def check_memory_reads(self) -> None:
+        """Refuse a memory whose fusion cannot report how much a chunk reads of each remembered entry."""
         fusion = None if self.memory == NONE else find_mechanism(self.memory).fusion
         if self.memory == NONE or (fusion is not None and not fusion.reports_reads):
             raise MemobenchError(
@@ -511,30 +514,35 @@ class MemobenchMemConfig(PI05Config):
     # -- called by LeRobot -----------------------------------------------------------------------------------------
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
-        """Return the default optimizer of a training."""
-        return FusedAdamWConfig(**vars(super().get_optimizer_preset()))
+        """Return the optimizer of a training."""
+        assert self.optimizer_lr is not None  # set by construction
+        return FusedAdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
         """Return the default learning-rate schedule of a training."""
         final = self.dimensions.final_learning_rate
         return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=final)
 
-    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Add the objects of a dataset with pictures to the inputs; LeRobot does not recognise their column.
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """Actions of a training sample, relative to its frame."""
+        return list(range(self.chunk_size))
 
-        LeRobot calls this with a dataset's ``features`` before it makes the policy.
-        """
+    observation_delta_indices = reward_delta_indices = None
+
+    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
+        """Add the objects of a dataset with pictures to the inputs; LeRobot does not recognise their column."""
         if not self.uses_pictures and PRIVILEGED in features:
             shape = tuple(features[PRIVILEGED]["shape"])
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
     def validate_features(self) -> None:
-        """Remove features that this perception does not read; with a detector, add its cameras.
-
-        Raises:
-            MemobenchError: object slots or the remembered camera are missing, or there are more numbers than the
-                initial weights have room for.
-        """
+        """Remove features that this perception does not read; with a detector, add its cameras."""
         unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
         for key in [key for key, one in self.input_features.items() if one.type is unseen or key in CLOCK]:
             del self.input_features[key]
@@ -550,7 +558,8 @@ class MemobenchMemConfig(PI05Config):
             )
         self._choose_memory_camera()
         self._fit_numbers()
-        super().validate_features()
+        self.input_features.setdefault(OBS_STATE, PolicyFeature(FeatureType.STATE, (self.max_state_dim,)))
+        self.output_features.setdefault(ACTION, PolicyFeature(FeatureType.ACTION, (self.max_action_dim,)))
 
     def _choose_memory_camera(self) -> None:
         cameras = [*self.image_features]
@@ -563,7 +572,6 @@ class MemobenchMemConfig(PI05Config):
             )
 
     def _fit_numbers(self) -> None:
-        """Raise ``max_state_dim`` and ``max_action_dim`` to the features' lengths, unless weights are loaded."""
         state, action = self.robot_state_feature, self.action_feature
         for name, feature in (("max_state_dim", state), ("max_action_dim", action)):
             needed = 0 if feature is None else feature.shape[0]
@@ -579,10 +587,8 @@ class MemobenchMemConfig(PI05Config):
 
 
 def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
-    """Return the conditions of the fields of a configuration that are not always used, ours first."""
-    own = {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
-    known = {one.name for one in fields(config)}  # LeRobot 0.6.1 lacks those of its main branch
-    return own | {name: condition for name, condition in INHERITED_CONDITIONS.items() if name in known}
+    """Return the conditions of the fields of a configuration that are not always used."""
+    return {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
 
 
 def memory_defaults() -> dict[str, Any]:

@@ -1,8 +1,4 @@
-"""Encoders of pictures: present pictures to prefix tokens, remembered pictures to the input of a memory.
-
-`ObservationEncoder` is the interface. `ImageTowerEncoder` is pi0.5's frozen image tower; `VisualTokenEncoder` reads
-tokens of the frozen encoder of `lerobot_memobench.perception`. Encoders of objects are in `objects`.
-"""
+"""Encoders of pictures: present pictures to prefix tokens, remembered pictures to the input of a memory."""
 
 from __future__ import annotations
 
@@ -21,7 +17,7 @@ from torch.nn.functional import interpolate, rms_norm
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
-from lerobot_memobench.policies.compatibility import cure
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 
 if TYPE_CHECKING:
@@ -30,8 +26,7 @@ if TYPE_CHECKING:
 TOKEN_SCALE = 8.0
 """Factor of the tokens that trained encoders add to the prefix; with 1 they learned more slowly."""
 PrefixParts = tuple[list[Tensor], list[Tensor]]
-"""Present observations in place of LeRobot's images: parts (B, ...), and their masks: (B,) for a whole part, or (B, n)
-per token."""
+"""Present observations: parts (B, ...), and their masks: (B,) for a whole part, or (B, n) per token."""
 
 
 class ObservationEncoder(ABC):
@@ -62,9 +57,9 @@ class ObservationEncoder(ABC):
         """Return a training batch with simulated errors of the sensors."""
         return batch
 
-    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts | None:
-        """Return the parts of a batch of present observations; None: LeRobot's images."""
-        return None
+    @abstractmethod
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
+        """Return the parts of a batch of present observations."""
 
     @abstractmethod
     def prefix(self, observed: Tensor) -> Tensor:
@@ -91,9 +86,7 @@ def seed_parameters(module: nn.Module, seed: int) -> None:
             if parameter.ndim == 1:
                 parameter.fill_(0.0 if name.endswith("bias") else 1.0)
             else:
-                fan_in = parameter[0].numel()
-                noise = torch.randn(parameter.shape, generator=generator) / fan_in**0.5
-                parameter.copy_(noise)
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) / parameter[0].numel() ** 0.5)
 
 
 def fingerprint(modules: dict[str, nn.Module]) -> str:
@@ -132,21 +125,18 @@ def thumbnails(pictures: Tensor) -> Tensor:
 
 def pool_tokens(tokens: Tensor) -> Tensor:
     """Mean-pool the patch tokens of square images (N, g*g, D) to (N, 16, D); g is a multiple of 4 (16 at full size)."""
-    patches = tokens.shape[1]
-    side = round(patches**0.5)
-    if side * side != patches or side % MEMORY_GRID:
-        raise ValueError(f"cannot pool {patches} tokens to a {MEMORY_GRID}x{MEMORY_GRID} grid")
+    block = round(tokens.shape[1] ** 0.5) // MEMORY_GRID
     return reduce(
-        tokens, "n (gy by gx bx) d -> n (gy gx) d", "mean", gy=MEMORY_GRID, gx=MEMORY_GRID, by=side // MEMORY_GRID
+        tokens, "n (gy by gx bx) d -> n (gy gx) d", "mean", gy=MEMORY_GRID, gx=MEMORY_GRID, by=block, bx=block
     )
 
 
 class ImageTowerEncoder(ObservationEncoder):
-    """The image tower, and the projection of its tokens to the language model's width.
+    """pi0.5's frozen image tower, and the projection of its tokens to the language model's width.
 
     Args:
-        resolution: height and width of the tower's pictures, pixels.
-        camera: the remembered camera. thumbnails: remember small grey copies instead of tokens.
+        resolution: height and width of the tower's pictures, pixels. camera: the remembered one.
+        cameras: of the present. thumbnails: remember small grey copies instead of tokens.
     """
 
     tokens_per_frame = MEMORY_GRID**2
@@ -158,10 +148,11 @@ class ImageTowerEncoder(ObservationEncoder):
         projector: PaliGemmaMultiModalProjector,
         resolution: tuple[int, int],
         camera: str,
+        cameras: Sequence[str] = (),
         thumbnails: bool = False,
     ) -> None:
         self.tower, self.projector, self.resolution = tower, projector, resolution
-        self.memory_input, self.thumbnails = camera, thumbnails
+        self.cameras, self.memory_input, self.thumbnails = list(cameras), camera, thumbnails
         self.dim: int = projector.linear.out_features
 
     @cached_property
@@ -175,16 +166,30 @@ class ImageTowerEncoder(ObservationEncoder):
         pictures = batch[self.memory_input][list(rows)]
         return thumbnails(pictures) if self.thumbnails else self(pictures)
 
+    def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
+        """Return the tower's pictures of all cameras; black ones, masked, for cameras that the batch lacks."""
+        pictures = [self._resized(batch[camera]) for camera in self.cameras if camera in batch]
+        if not pictures:
+            raise MemobenchError(f"The observation has no picture; {hint('picture', batch)}")
+        missing = len(self.cameras) - len(pictures)
+        rows, blank = len(pictures[0]), torch.full_like(pictures[0], -1.0)
+        masks = [torch.full((rows,), real) for real in [True] * len(pictures) + [False] * missing]
+        return [*pictures, *[blank] * missing], masks
+
+    def _resized(self, images: Tensor) -> Tensor:
+        """Return pictures (N, 3, H, W) in [0, 1] as those of the tower, in [-1, 1]."""
+        images = images.to(next(self.tower.parameters()).device, torch.float32)
+        if tuple(images.shape[-2:]) != tuple(self.resolution):
+            images = resize_with_pad_torch(images, *self.resolution)
+        return images * 2.0 - 1.0
+
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:
         """Encode pictures (N, 3, H, W) float in [0, 1] to (N, 16, D) bfloat16 on the tower's device."""
-        device = next(self.tower.parameters()).device
-        images = images.to(device, torch.float32)
-        if tuple(images.shape[-2:]) != tuple(self.resolution):
-            images = resize_with_pad_torch(images, *self.resolution)
+        images = self._resized(images)
         # With mixed precision, tokens of a rollout would differ from cached tokens.
-        with torch.autocast(device.type, enabled=False):
-            return pool_tokens(self.prefix(images * 2.0 - 1.0)).to(torch.bfloat16)
+        with torch.autocast(images.device.type, enabled=False):
+            return pool_tokens(self.prefix(images)).to(torch.bfloat16)
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return all patch tokens (B, g*g, D) of pictures (B, 3, H, W) in [-1, 1], in the pictures' precision.
@@ -275,11 +280,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures.
-
-        Raises:
-            MemobenchError: the batch has neither for a camera.
-        """
+        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures."""
         parts = [self._tokens(batch, camera) for camera in self.cameras]
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
 
@@ -287,7 +288,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         if encoded_key(camera) in batch:
             return batch[encoded_key(camera)]
         if camera not in batch:
-            raise MemobenchError(f"The observation has no '{camera}', which this policy reads; {cure(camera, batch)}")
+            raise MemobenchError(f"The observation has no '{camera}', which this policy reads; {hint(camera, batch)}")
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:

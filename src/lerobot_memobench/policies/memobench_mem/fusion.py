@@ -1,7 +1,9 @@
-"""How actions read memory tokens: the interface `MemoryFusion`, its `Reading`, and two general implementations.
+"""How actions read memory tokens, and the operations of pi0.5's layers that this needs.
 
-`Modulation` scales and shifts the input of each feed-forward layer of the action expert (RoboMME's modulator);
-`Context` appends memory to the prefix. Shapes: B rows, L memory tokens, W width of the action expert, T action tokens.
+`MemoryFusion` is the interface, `MemoryPass` the memory in one pass of the model. `Modulation` scales and shifts the
+input of each feed-forward layer of the action expert (RoboMME's modulator); `Context` appends memory to the prefix.
+
+Shapes: B rows, L memory tokens, W width of the action expert, T action tokens, N queries, M keys, H heads of width d.
 """
 
 from __future__ import annotations
@@ -9,14 +11,81 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from einops import rearrange
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.layers import attend, hidden, rms_norm, rotary, rotate
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryTokens
+
+# -- operations -------------------------------------------------------------------------------------------------------
+
+
+def rms_norm(x: Tensor) -> Tensor:
+    """Return x (..., W) with a mean square of one, in float32."""
+    return F.rms_norm(x.to(torch.float32), x.shape[-1:], eps=1e-6)
+
+
+def scaled_and_shifted(normed: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return normed (B, N, W) scaled and shifted, and the gate (B, 1, W), by scale, shift and gate (B, 1, 3 W)."""
+    scale, shift, gate = modulation.chunk(3, dim=-1)
+    return torch.addcmul(shift.float(), normed, 1 + scale.float()), gate
+
+
+def modulated(x: Tensor, modulation: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the adaptive norm of x (B, N, W), given scale, shift and gate (B, 1, 3 W), and the gate (B, 1, W)."""
+    normed, gate = scaled_and_shifted(rms_norm(x), modulation)
+    return normed.to(x.dtype), gate.to(x.dtype)
+
+
+def rotary(positions: Tensor, frequencies: Tensor) -> Tensor:
+    """Return cosine and sine (..., N, d / 2, 2) of positions (..., N) at each frequency (d / 2,)."""
+    angles = positions.unsqueeze(-1).to(torch.float32) * frequencies.to(torch.float32)
+    return torch.stack([angles.cos(), angles.sin()], dim=-1)
+
+
+def rotate(x: Tensor, rotations: Tensor) -> Tensor:
+    """Return x (..., d) rotated by cosines and sines (..., d / 2, 2); halves are paired as in Gemma.
+
+    The result interleaves the two numbers of each pair, in queries and keys alike, which keeps their products.
+    """
+    first, second = x.chunk(2, dim=-1)
+    cos, sin = rotations.to(x.dtype).unbind(-1)
+    return torch.stack([first * cos - second * sin, second * cos + first * sin], dim=-1).flatten(-2)
+
+
+def hidden(real: Tensor) -> Tensor:
+    """Return the bias of attention scores: 0 for tokens that are read (``real``), very low for all others."""
+    return torch.where(real, 0.0, torch.finfo(torch.float32).min / 2)
+
+
+def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, collected: list[Tensor] | None = None) -> Tensor:
+    """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
+
+    Args:
+        bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
+        collected: a list to which the attention weights (B, H, N, M) are appended.
+    """
+    rows, count, heads, width = query.shape
+    # All heads share keys and values, so heads are further queries of one product.
+    flat, bias = query.reshape(rows, count * heads, width), bias.to(query.dtype)
+    if bias.shape[1] > 1:
+        bias = bias.repeat_interleave(heads, dim=1)
+    # On a CPU a plan has few queries: stored scores are faster then, and actions of recorded evaluations stay the same.
+    if collected is None and (query.is_cuda or torch.is_grad_enabled()):
+        mask = bias.expand(-1, count * heads, -1)[:, None]
+        read = F.scaled_dot_product_attention(flat[:, None], key[:, None], value[:, None], mask)
+        return read.view(rows, count, heads * width)
+    scores = torch.baddbmm(bias, flat, key.transpose(1, 2), alpha=width**-0.5)
+    weights = scores.softmax(dim=-1, dtype=torch.float32)
+    if collected is not None:
+        collected.append(weights.unflatten(1, (count, heads)).transpose(1, 2))
+    return torch.bmm(weights.to(value.dtype), value).view(rows, count, heads * width)
+
+
+# -- the interface ----------------------------------------------------------------------------------------------------
 
 
 class Prefix(NamedTuple):
@@ -27,7 +96,7 @@ class Prefix(NamedTuple):
         instruction: (B, W), added to the condition of the expert's norms; None: no such term.
         attends: (B, N, N) bool, whether a token (first N) attends to another (last N); None: to all real tokens.
         unread: number of leading tokens to which actions do not attend.
-        asked: tokens whose last states are passed to `Reading.read_out`; None: no tokens.
+        asked: tokens whose last states are passed to `MemoryPass.read_out`; None: no tokens.
     """
 
     tokens: Tensor
@@ -43,11 +112,11 @@ class Prefix(NamedTuple):
         return Prefix(torch.cat([self.tokens, more], dim=1), torch.cat([self.real, real], dim=1), self.instruction)
 
 
-class Reading:
+class MemoryPass:
     """The memory in one pass of the model. This base class is plain pi0.5, which reads no memory.
 
     Attributes:
-        watches: the parts of the model whose attention weights `shares` needs: ``prefix``, ``actions``, ``memory``.
+        watches: the parts of the model (``prefix``, ``actions``, ``memory``) whose attention `attention_shares` needs.
         outputs: results of the pass other than actions, for `MemoryMechanism.losses`.
         attention: part -> the attention weights of its layers, if the pass is watched; else empty.
     """
@@ -59,11 +128,7 @@ class Reading:
         self.attention: dict[str, list[Tensor]] = {part: [] for part in self.watches} if watched else {}
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Return the model's prefix, given pi0.5's.
-
-        Args:
-            state: index of the token of the robot's state; None: no such token.
-        """
+        """Return the model's prefix, given pi0.5's and the index of the token of the robot's state (None: no token)."""
         return prefix
 
     def actions(self, tokens: Tensor) -> Tensor:
@@ -77,8 +142,7 @@ class Reading:
     def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
         """Return the input (B, T, W) of a layer's feed-forward, given pi0.5's.
 
-        Args:
-            normed: (B, T, W), the tokens at a mean square of one, before pi0.5's scale and shift.
+        ``normed`` (B, T, W) are the tokens at a mean square of one, before pi0.5's scale and shift.
         """
         return inputs
 
@@ -88,7 +152,7 @@ class Reading:
     def expert_states(self, states: Tensor) -> None:
         """Receive the expert's last states (B, T, W)."""
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the share of attention on each memory token in a watched pass, (B, L) per layer."""
         return []
 
@@ -97,24 +161,20 @@ class MemoryFusion(ABC):
     """How actions read memory tokens. It is built once per model and may add parameters to it.
 
     Attributes:
-        reports_reads: whether `Reading.shares` of a watched pass is implemented.
+        reports_reads: whether `MemoryPass.attention_shares` of a watched pass is implemented.
         parts: names of the modules that it adds to the model, each with a dot.
     """
 
     reports_reads: ClassVar[bool] = False
     parts: ClassVar[tuple[str, ...]] = ()
 
-    @abstractmethod
-    def __init__(self, model: nn.Module, memory_dim: int, expert_dim: int) -> None:
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
         """Prepare ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+        self.model = model
 
     @abstractmethod
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
-        """Begin a pass over a memory of width ``memory_dim``.
-
-        Args:
-            watched: collect attention weights for `Reading.shares`.
-        """
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
+        """Begin a pass over a memory; ``watched``: collect attention weights for `MemoryPass.attention_shares`."""
 
 
 # -- modulation -------------------------------------------------------------------------------------------------------
@@ -137,7 +197,6 @@ class RMSNorm(nn.Module):
 
 @functools.lru_cache(maxsize=64)
 def _places(begin: int, count: int, width: int, device: torch.device) -> Tensor:
-    """Return the rotations of ``count`` positions from ``begin`` on, for vectors of this width."""
     with torch.inference_mode(False):  # training may use the cached tensors after a rollout
         frequencies = _ROPE_BASE ** -(torch.arange(width // 2, dtype=torch.float32, device=device) / (width // 2))
         return rotary(torch.arange(begin, begin + count, device=device), frequencies)
@@ -145,8 +204,7 @@ def _places(begin: int, count: int, width: int, device: torch.device) -> Tensor:
 
 def rotate_from(x: Tensor, begin: int) -> Tensor:
     """Apply rotary position embedding to x (..., N, d) at positions ``begin``, ``begin`` + 1, ..."""
-    places = _places.__wrapped__ if torch.compiler.is_compiling() else _places  # torch warns about the cache
-    return rotate(x, places(begin, x.shape[-2], x.shape[-1], x.device))
+    return rotate(x, _places(begin, x.shape[-2], x.shape[-1], x.device))
 
 
 class MemoryModulator(nn.Module):
@@ -171,34 +229,31 @@ class MemoryModulator(nn.Module):
 
     def keys(self, memory: MemoryTokens) -> tuple[Tensor, Tensor]:
         """Return rotated keys and values, both (B, L, head_dim), of memory of width W."""
-        normed = memory.through(self.memory_norm)
-        key, value = (normed.through(linear).rows() for linear in (self.key, self.value))
+        normed = memory.map(self.memory_norm)
+        key, value = (normed.map(linear).rows() for linear in (self.key, self.value))
         return rotate_from(key, 0), value
 
     def forward(
-        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], found: list[Tensor] | None = None
+        self, normed: Tensor, memory: MemoryTokens, keys: tuple[Tensor, Tensor], collected: list[Tensor] | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
-        A row whose memory is fully masked reads zeros.
-
-        Args:
-            memory: of width W. keys: of `keys`.
-            found: a list to which the attention on each memory token (B, L) is appended.
+        A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
+        ``collected``.
         """
-        weights: list[Tensor] | None = None if found is None else []
+        weights = None if collected is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
         # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
-        if found is not None and weights is not None:
-            found.append(weights[0].mean(dim=(1, 2)) * memory.mask)
+        if collected is not None and weights is not None:
+            collected.append(weights[0].mean(dim=(1, 2)) * memory.mask)
         read = read * memory.mask.any(dim=1)[:, None, None]
         scale, shift = self.modulation(self.out(read)).chunk(2, dim=-1)
         return scale, shift
 
 
-class ModulatedReading(Reading):
+class ModulationPass(MemoryPass):
     """A pass whose expert is scaled and shifted by memory of the expert's width W."""
 
     watches = ("memory",)
@@ -216,7 +271,7 @@ class ModulatedReading(Reading):
         scale, shift = modulator(normed, self.memory, keys, self.attention.get("memory"))
         return torch.addcmul(shift, inputs, 1 + scale)
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the modulators' attention to each token."""
         return self.attention["memory"]
 
@@ -228,21 +283,20 @@ class Modulation(MemoryFusion):
     parts = ("memory_to_expert.", "modulators.")
 
     def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
+        super().__init__(model, memory_dim, expert_dim)
         model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
         layers = model.paligemma_with_expert.gemma_expert.model.layers
         model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Project the memory to the expert's width."""
-        projected = memory.through(cast(nn.Linear, self.model.memory_to_expert))
-        return ModulatedReading(projected, [*self.model.modulators], watched)
+        return ModulationPass(memory.map(self.model.memory_to_expert), [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------
 
 
-class ContextReading(Reading):
+class ContextPass(MemoryPass):
     """A pass whose prefix ends with the memory."""
 
     watches = ("actions",)
@@ -255,7 +309,7 @@ class ContextReading(Reading):
         """Append the memory, which attends and is attended to like images and language."""
         return prefix.joined(self.memory.rows(), self.memory.mask)
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the share of the actions' attention on each memory token."""
         length = self.memory.mask.shape[1]
         # (B, heads, T, prefix and T), with memory at the prefix's end
@@ -270,9 +324,6 @@ class Context(MemoryFusion):
 
     reports_reads = True
 
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        pass
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory."""
-        return ContextReading(memory, watched)
+        return ContextPass(memory, watched)

@@ -1,7 +1,6 @@
-"""``memobench_mem``: LeRobot's pi0.5 with a visual memory, trained with or without alignment to subgoal texts.
+"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts.
 
-This file is the policy: its construction, updates (``forward``) and actions (``select_action``). The network is in
-`network`, the rows of a rollout in `rollout`, checkpoints in `checkpoints`.
+This file is the policy: its construction, updates (``forward``) and actions (``select_action``).
 """
 
 from __future__ import annotations
@@ -9,15 +8,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.common.vla_utils import pad_vector
-from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor, nn
@@ -27,9 +24,7 @@ from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
-from lerobot_memobench.policies.compatibility import cure
-from lerobot_memobench.policies.memobench_mem.alignment import alignment_loss, make_alignment
-from lerobot_memobench.policies.memobench_mem.backbone import Precision
+from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,
     load_base_weights,
@@ -40,16 +35,13 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     weights_file,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.encoders import (
-    ENCODED,
-    ObservationEncoder,
-    PrefixParts,
-    VisualTokenEncoder,
-)
-from lerobot_memobench.policies.memobench_mem.fusion import Reading
+from lerobot_memobench.policies.memobench_mem.encoders import ENCODED, ObservationEncoder, VisualTokenEncoder
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.losses import (
+    alignment_loss,
     counted_actions,
     losses_of,
+    make_alignment,
     mean_losses,
     noise_and_time,
 )
@@ -67,18 +59,19 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemoryTokens,
     Query,
 )
-from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation
+from lerobot_memobench.policies.memobench_mem.network import MemoryPI05, Observation, Precision
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.rollout import Rollout
+from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory, Rollout
 from lerobot_memobench.policies.memobench_mem.sizes import REGRESSION
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
-from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
+from lerobot_memobench.protocol import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
 # Importing the processor registers the steps of saved pipelines, which are built after the policy.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
 
 logger = logging.getLogger(__name__)
 
+LANGUAGE = (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -87,13 +80,13 @@ OWN_MODULES = (
 trained."""
 
 
-class MemobenchMemPolicy(PI05Policy):
+class MemobenchMemPolicy(PreTrainedPolicy):
     """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame.
 
     Attributes:
         alignment: objective and head that align memory with text; None without alignment.
         precision: of the weights.
-        rollout: the rows of the present rollout.
+        rollout: the environments of the present rollout.
         open_loop: whether observations do not follow the actions, as in replayed episodes: no hand is stalled.
     """
 
@@ -118,28 +111,23 @@ class MemobenchMemPolicy(PI05Policy):
             load_base: False if a checkpoint's weights are loaded afterwards.
             draw: False to skip the initialisation of weights, which takes two minutes at full size.
         """
-        # As PI05Policy.__init__, whose model class is fixed.
-        PreTrainedPolicy.__init__(self, config)
+        super().__init__(config)
         config.validate_features()
-        self.init_rtc_processor()
         with contextlib.nullcontext() if draw else no_init_weights():
-            self.model = MemoryPI05(config, rtc_processor=self.rtc_processor)
+            self.model = MemoryPI05(config)
         dims = config.dimensions
         self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, config.tokens_per_frame)
         self.precision = Precision(list(self.parameters()))
         if dataset_meta is not None:
             self.precision.settle()  # before loading weights, which may be float32
         if config.base_weights and load_base:
-            source = config.base_weights
-            path = weights_file(source, named=f"--policy.base_weights='{source}'", fix="give a pi0.5 checkpoint")
-            load_base_weights(self.model, self._fix_pytorch_state_dict_keys(read_tensors(path), config), source)
+            load_base_weights(self.model, read_tensors(weights_file(config.base_weights)), config.base_weights)
         elif isinstance(self.perception, VisualTokenEncoder) and load_base:
             assert config.visual_encoder is not None
             self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
-        self.rollout = Rollout(self._remembers, config.memory_stride)
         self._watched = self.open_loop = False
         self.reset()
         self._thread: int | None = None  # set by the first action
@@ -162,18 +150,13 @@ class MemobenchMemPolicy(PI05Policy):
     def _remembers(self) -> bool:
         return self.model.memory is not None
 
-    def _preprocess_images(self, batch: dict[str, Tensor]) -> PrefixParts:
-        """Return the model's inputs instead of images: the observation's parts, and the state if it has a token."""
-        parts, masks = self.perception.present(batch) or super()._preprocess_images(batch)
+    def _observed(self, batch: dict[str, Tensor]) -> Observation:
+        parts, masks = self.perception.present(batch)
         if self.config.state_token:
             state = pad_vector(batch[OBS_STATE], self.config.max_state_dim)
             parts, masks = [*parts, state], [*masks, torch.ones(len(state), dtype=torch.bool)]
-        return [part.to(self._device) for part in parts], [mask.to(self._device) for mask in masks]
-
-    def _seen(self, batch: dict[str, Tensor]) -> Observation:
-        """Return the model's inputs of a batch."""
-        parts, masks = self._preprocess_images(batch)
-        return Observation(parts, masks, batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK])
+        parts, masks = ([tensor.to(self._device) for tensor in tensors] for tensors in (parts, masks))
+        return Observation(parts, masks, *(batch[key] for key in LANGUAGE))
 
     # -- training --------------------------------------------------------------------------------------------------
 
@@ -187,23 +170,18 @@ class MemobenchMemPolicy(PI05Policy):
         return list(self.trained_parameters().values())
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Any]]:
-        """Return the action loss, plus the memory's losses and the weighted alignment, of a preprocessed batch.
+        """Return the action loss, plus the memory's losses and the weighted alignment, and numbers to log.
 
         When the loss is only measured (``eval_loss``: evaluation mode without gradients), actions follow the subgoal
         that a privileged memory chooses, and the memory's own losses compare the choice with the true one.
 
+        The numbers are ``action_loss``, the memory's losses, and with an alignment ``align_loss`` (unweighted),
+        ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1`` (share of memory
+        vectors whose nearest text in the batch is their own).
+
         Args:
-            batch: the inputs of LeRobot's pi0.5, and ``memory.*`` and ``phase`` of the training's preprocessor. A
-                policy without memory also takes batches of LeRobot's own trainer.
+            batch: of the training's preprocessor. A policy without memory also takes those of LeRobot's own trainer.
             reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
-
-        Returns:
-            The loss, and numbers to log: ``action_loss``, the memory's losses, and with an alignment ``align_loss``
-            (unweighted), ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1``
-            (share of memory vectors whose nearest text in the batch is their own).
-
-        Raises:
-            MemobenchError: the batch has no memory.
         """
         batch = self.perception.observed(self._with_phase(batch))
         measures = not self.training and not torch.is_grad_enabled()
@@ -211,9 +189,10 @@ class MemobenchMemPolicy(PI05Policy):
             memory = self.read_memory(batch)
             if measures and self.config.privileged_memory:  # actions follow the memory's own choice
                 memory = self.read_memory(_without_labels(batch))
-            reading = self.model.reading(memory)
-            per_sample, total, logged = self._action_loss(batch, reading)
-            for name, loss in self._memory_losses(batch, reading).items():
+            memory_pass = self.model.memory_pass(memory)
+            per_sample, total, logged = self._action_loss(batch, memory_pass)
+            own = {} if self.model.memory is None else self.model.memory.losses({**batch, **memory_pass.outputs})
+            for name, loss in own.items():
                 per_sample, total = per_sample + loss, total + loss.mean()
                 logged[f"memory_{name}_loss"] = loss.mean().item()
             if self.alignment is not None and memory is not None:
@@ -228,11 +207,6 @@ class MemobenchMemPolicy(PI05Policy):
         return (per_sample if reduction == "none" else total), logged
 
     def _with_phase(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return a training batch with the phase of each sample, if the dataset has phases.
-
-        Raises:
-            MemobenchError: the policy has a memory and the batch has none.
-        """
         if self._remembers and FRAMES not in batch:
             raise MemobenchError(
                 f"the training batch has no '{FRAMES}': memory={self.config.memory} learns from earlier frames of the "
@@ -249,16 +223,8 @@ class MemobenchMemPolicy(PI05Policy):
         histories = Histories(*parts).to(self._device)
         return self.model.memory.replay(histories, self._query(batch))
 
-    def _memory_losses(self, batch: dict[str, Tensor], reading: Reading) -> dict[str, Tensor]:
-        memory = self.model.memory
-        return {} if memory is None else memory.losses({**batch, **reading.outputs})
-
     def _query(self, batch: dict[str, Tensor], rows: Sequence[int] | None = None, *, writes: bool = False) -> Query:
-        """Return the present of some rows of a batch, as far as the memory needs it.
-
-        Args:
-            rows: None: all. writes: whether the query is for writing, which has the frame's own tokens.
-        """
+        """Return the present of some rows of a batch (None: all), as far as the memory needs it to read or write."""
         memory, device = self.model.memory, self._device
         assert memory is not None
         rows = range(len(batch[OBS_STATE])) if rows is None else rows
@@ -270,159 +236,127 @@ class MemobenchMemPolicy(PI05Policy):
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)
         return query
 
-    def _action_loss(self, batch: dict[str, Tensor], reading: Reading) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def _action_loss(self, batch: dict[str, Tensor], memory: MemoryPass) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Return the action loss per sample (B,), its mean over the counted actions, and numbers to log."""
-        seen, actions = self._seen(batch), self.prepare_action(batch)
-        drawn = noise_and_time(self.config.objective, self.model, actions)
-        squared = self.model.forward(seen, actions, *drawn, reading)[:, :, : self._action_dim]
+        seen, actions = self._observed(batch), pad_vector(batch[ACTION], self.config.max_action_dim)
+        drawn = noise_and_time(self.config.objective, actions)
+        squared = self.model.forward(seen, actions, *drawn, memory)[:, :, : self._action_dim]
         losses = losses_of(self.config.objective, squared)
-        found = mean_losses(losses, counted_actions(batch, losses))
-        logged = {"action_loss": found.mean.item(), "loss_per_dim": found.per_dim.cpu().tolist()}
-        return found.per_sample, found.mean, logged
+        loss = mean_losses(losses, counted_actions(batch, losses))
+        logged = {"action_loss": loss.mean.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
+        return loss.per_sample, loss.mean, logged
 
     # -- acting ----------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
         """Clear histories and planned actions. LeRobot calls it once per batch of episodes."""
-        super().reset()
-        self.rollout.reset()
-        self.rollout.late = self._rtc_enabled()
+        self.rollout = Rollout(self._remembers, self.config.memory_stride)
         self._calls = self._planned = 0
-        self._began: float | None = None
         self._thread = threading.get_ident()
-        self._acting_rows: list[int] = []
+        self._acting: list[EnvMemory] = []
 
     def corrupt_memory(self, how: str, rows: Sequence[int]) -> None:
-        """Change what rows remember, before they observe the next frame; planned actions are kept.
+        """Change what environments (numbers in the batch) remember, before the next frame; planned actions are kept.
 
-        Args:
-            how: ``delete``: they remember from the next frame on; ``swap``: they get the memory of the next row of the
-                batch; ``noise``: normal noise with the standard deviation of its values is added to it.
+        ``delete``: they remember from the next frame on; ``swap``: they get the memory of the next one of the batch;
+        ``noise``: normal noise with the standard deviation of its values is added to it.
         """
-        memory = self.model.memory
+        memory, envs = self.model.memory, self.rollout.envs
         assert memory is not None  # `run.plan` refuses others
-        held = self.rollout.rows
 
         def noised(row: int) -> Any:
-            return memory.noised(held[row].memory, torch.Generator().manual_seed(held[row].seed))
+            return memory.noised(envs[row].memory, torch.Generator().manual_seed(envs[row].seed))
 
-        changed = {DELETE: lambda row: None, SWAP: self.rollout.of_next, NOISE: noised}[how]
+        changed = {DELETE: lambda row: None, SWAP: self.rollout.next_env_memory, NOISE: noised}[how]
         self.rollout.corrupt(rows, changed)
 
     def drop_queued_actions(self) -> None:
         """Replan at the next step and keep the histories; LeRobot's main branch calls it for a new instruction."""
-        for row in self.rollout.rows:
-            row.drop_chunk()
+        for env in self.rollout.envs:
+            env.drop_chunk()
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the next action of every row (B, A), normalised.
+        """Return the next action of every environment (B, A), normalised.
 
-        A row is replanned when its execution begins or its queue is empty (`Row.begin_chunk`). A chunk depends on its
-        own row only, so rows of a batch are independent. No chunk is planned in the prompt phase, in which actions have
-        no effect, and for frozen rows.
+        An environment is replanned when its execution begins or its queue is empty (`EnvMemory.begin_chunk`). A chunk
+        depends on its own environment only. No chunk is planned in the prompt phase, in which actions have no effect,
+        and for frozen environments.
         """
         self._check_thread()
         if self.training:  # calling eval() at every step would take a millisecond
             self.eval()
-        _, _, frozen = self.observe(batch)
-        rows = self.rollout.rows
-        prompt = [phase == PROMPT for phase in _column(batch, OBS_PHASE) or [EXECUTION] * len(rows)]
-        for number, row in enumerate(rows):
-            if prompt[number]:
-                row.drop_chunk()
-        acting = self._acting_rows = [row for row in range(len(rows)) if not prompt[row] and not frozen[row]]
-        wanting = [number for number in acting if not rows[number].queue]
-        if wanting:
-            chunks = self.plan(batch, wanting, self._noise(wanting))
+        self.observe(batch)
+        envs = self.rollout.envs
+        phases = _column(batch, OBS_PHASE) or [EXECUTION] * len(envs)
+        acting = [row for row, env in enumerate(envs) if phases[row] != PROMPT and not env.frozen]
+        if due := [row for row in acting if not envs[row].queue]:
+            chunks = self.plan(batch, due, self._noise(due))
             states = batch[OBS_RAW_STATE] if self.config.uses_objects and not self.open_loop else None
-            for number, chunk in zip(wanting, chunks.float().cpu(), strict=True):
-                state = None if states is None else states[number]
-                rows[number].begin_chunk(chunk, self.config.n_action_steps, state)
-        for number in acting:
-            rows[number].last = rows[number].queue.popleft()
+            for row, chunk in zip(due, chunks.float().cpu(), strict=True):
+                envs[row].begin_chunk(chunk, self.config.n_action_steps, None if states is None else states[row])
+        self._acting = [envs[row] for row in acting]
+        for env in self._acting:
+            env.last = env.queue.popleft()
         none = torch.zeros(self._action_dim)
-        return torch.stack([none if row.last is None else row.last for row in rows]).to(self._device)
+        return torch.stack([none if env.last is None else env.last for env in envs]).to(self._device)
 
     def _check_thread(self) -> None:
-        """Check that one thread runs the whole rollout; LeRobot's ``env.max_parallel_tasks`` would mix several."""
+        # LeRobot's env.max_parallel_tasks would mix several rollouts.
         if self._thread is None:
             self._thread = threading.get_ident()
         if self._thread != threading.get_ident():
             raise MemobenchError(
                 "two threads act with one memobench_mem policy, which would mix the memories of their rollouts; "
-                "evaluate with --env.max_parallel_tasks=1, and more rows per task by --eval.batch_size."
+                "evaluate with --env.max_parallel_tasks=1, and more environments per task by --eval.batch_size."
             )
 
-    def observe(self, batch: dict[str, Tensor]) -> tuple[list[int], list[bool], list[bool]]:
-        """Add the present frames of all rows to their histories.
-
-        Returns:
-            Per row its control step since the episode began, whether a new episode began, and whether it is frozen.
-        """
+    def observe(self, batch: dict[str, Tensor]) -> None:
+        """Add the present frames of all environments to their histories."""
         name = self.perception.memory_input
         if name not in batch:
             what = f"'{name}'" if name else "picture"
-            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {cure(name, batch)}")
-        count = len(batch[name])
-        steps = _column(batch, OBS_STEP) or [self._step()] * count
-        phases = _column(batch, OBS_PHASE) if OBS_STEP in batch else None
-        clocks = list(zip(phases or [EXECUTION] * count, steps, strict=True))
+            raise MemobenchError(f"the observation has no {what}, which this policy remembers; {hint(name, batch)}")
+        steps = _column(batch, OBS_STEP)
+        phases = None if steps is None else _column(batch, OBS_PHASE)
+        steps = steps or [self._calls] * len(batch[name])
         self._calls += 1
-        steps, started, frozen = self.rollout.observe(clocks, lambda rows: self._write(batch, rows))
+        clocks = list(zip(phases or [EXECUTION] * len(steps), steps, strict=True))
+        started = self.rollout.observe(clocks, lambda rows: self._write(batch, rows))
         observed = [key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch]
-        for row in range(count):
-            if started[row]:
-                self.rollout.rows[row].draw_seed(batch[key][row] for key in observed)
-        return steps, started, frozen
-
-    def _step(self) -> int:
-        """Return the control step since `reset` if observations have no clock: by calls, or in real time with RTC."""
-        if not self._rtc_enabled():
-            return self._calls
-        now = time.monotonic()
-        self._began = now if self._began is None else self._began
-        return round((now - self._began) * CONTROL_HZ)
+        for row, (env, begins) in enumerate(zip(self.rollout.envs, started, strict=True)):
+            if begins:
+                env.draw_seed(batch[key][row] for key in observed)
 
     @torch.no_grad()
     def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
-        """Write the present frames of some rows to their memories."""
-        memory = self.model.memory
+        memory, skips = self.model.memory, self.config.skips_repeated_frames
         assert memory is not None
         frames = self.perception.remember(batch, rows).to(self._device)
         with self.precision.computing(self._device):
-            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that rows are independent
-                held = self.rollout.rows[row]
-                repeated = held.memory is not None and held.stored is not None and torch.equal(frame, held.stored)
-                held.stored = frame
-                if repeated and not self.config.memory_repeats:
+            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that they are independent
+                env = self.rollout.envs[row]
+                if skips and env.memory is not None and env.stored is not None and torch.equal(frame, env.stored):
                     continue
+                env.stored = frame
                 query = self._query(batch, [row], writes=True)
-                state = memory.init(1) if held.memory is None else held.memory
-                held.memory = memory.observe(state, frame, torch.tensor([held.position], device=self._device), query)
+                state = memory.init(1) if env.memory is None else env.memory
+                env.memory = memory.observe(state, frame, torch.tensor([env.position], device=self._device), query)
 
     def remembered(self, batch: dict[str, Tensor], rows: Sequence[int]) -> MemoryTokens:
         """Return the memory tokens that chunks of some rows of the batch would read now."""
         memory = self.model.memory
         assert memory is not None
-        return memory.read(memory.join([self.rollout.rows[row].memory for row in rows]), self._query(batch, rows))
+        return memory.read(memory.join([self.rollout.envs[row].memory for row in rows]), self._query(batch, rows))
 
-    def plan(
-        self,
-        batch: dict[str, Tensor],
-        rows: list[int],
-        noise: Tensor,
-        training: bool = False,
-        **kwargs: Any,
-    ) -> Tensor:
+    def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, training: bool = False) -> Tensor:
         """Return action chunks (n, chunk, A) of some rows of the batch, given their histories and sampling noise.
 
-        Args:
-            training: whether the batch is a training batch, which has its own histories; labels are not read.
+        A ``training`` batch has its own histories; its labels are not read.
         """
-        inputs = [*self._inputs, *(key for key in batch if key.startswith(ENCODED))]
-        part = {key: batch[key][rows] for key in inputs if key in batch}
-        seen, memory = self._seen(part), None
+        inputs = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
+        part = {key: value[rows] for key, value in batch.items() if key in inputs or key.startswith(ENCODED)}
+        seen, memory = self._observed(part), None
         with self.precision.computing(self._device):
             if training:
                 memory = self.read_memory(_without_labels(batch))
@@ -430,18 +364,14 @@ class MemobenchMemPolicy(PI05Policy):
                 self._require_history(rows)
                 memory = self.remembered(batch, rows)
             watched = self._watched and memory is not None and not training
-            reading = self.model.reading(memory, watched)
-            actions = self.model.sample_actions(seen, noise.to(self._device), reading, **kwargs)
+            memory_pass = self.model.memory_pass(memory, watched)
+            actions = self.model.sample_actions(seen, noise.to(self._device), memory_pass)
             if watched and memory is not None:
-                self._keep_reads(rows, memory, reading)
+                envs = [self.rollout.envs[row] for row in rows]
+                reads = chunk_reads([env.position for env in envs], memory, memory_pass.attention_shares())
+                for env, read in zip(envs, reads, strict=True):
+                    env.reads.append(read)
         return actions[:, :, : self._action_dim]
-
-    def _keep_reads(self, rows: Sequence[int], memory: MemoryTokens, reading: Reading) -> None:
-        """Store the memory reads of the chunks of some rows."""
-        held = [self.rollout.rows[row] for row in rows]
-        found = chunk_reads([row.position for row in held], memory, reading.shares())
-        for row, read in zip(held, found, strict=True):
-            row.reads.append(read)
 
     def watch_memory(self, watched: bool = True) -> None:
         """Start or stop recording how much each chunk reads of the remembered entries, for `memory_reads`."""
@@ -449,83 +379,58 @@ class MemobenchMemPolicy(PI05Policy):
         self._watched = watched
 
     def memory_reads(self) -> list[list[Chunk]]:
-        """Return the memory reads of the chunks of each row's episode."""
-        return [row.reads for row in self.rollout.rows]
-
-    @property
-    def _inputs(self) -> list[str]:
-        """Keys of the present observation that the model reads, if present."""
-        images = [*self.config.image_features] if self.config.uses_pictures else []
-        objects = [OBS_ENV_STATE, OBS_RAW_STATE] if self.config.uses_objects else []
-        return [*images, *objects, OBS_STATE, OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK]
+        """Return the memory reads of the chunks of each environment's episode."""
+        return [env.reads for env in self.rollout.envs]
 
     def _require_history(self, rows: list[int]) -> None:
-        missed = self.rollout.missed(rows)
-        if missed is not None:
+        if (missed := self.rollout.missed(rows)) is not None:
             raise MemobenchError(
                 f"this policy remembers every {self.rollout.stride} control steps and did not observe step {missed} of "
                 "this episode, so its memory would differ from training; pass the observation of every control step to "
                 "select_action or observe."
             )
 
-    def _noise(self, rows: Iterable[int], draw: Callable[[int, tuple[int, int]], Tensor] | None = None) -> Tensor:
-        """Return noise (n, chunk, max_action_dim) for the plans of rows, by default their own; zeros by regression."""
+    def _noise(self, rows: Sequence[int], training: bool = False) -> Tensor:
+        """Return noise (n, chunk, max_action_dim) for plans; the episodes' own in a rollout, zeros by regression."""
         shape = self.config.chunk_size, self.config.max_action_dim
         if self.config.objective == REGRESSION:
-            return torch.stack([torch.zeros(shape) for _ in rows])
-        own = draw or (lambda row, shape: self.rollout.rows[row].noise(shape))
-        return torch.stack([own(row, shape) for row in rows])
+            return torch.zeros(len(rows), *shape)
+        return torch.stack([torch.randn(shape) if training else self.rollout.envs[row].noise(shape) for row in rows])
 
     def needs_observation(self) -> bool:
         """Return after an action whether the next observation's pictures or objects are read, for memory or a plan.
 
         The first frames of an episode and of its execution, which only the environment can foresee, are always read.
         """
-        return self.rollout.writes_next() or any(not self.rollout.rows[row].queue for row in self._acting_rows)
+        return self.rollout.writes_next() or any(not env.queue for env in self._acting)
 
     def has_planned_action(self) -> bool:
         """Return whether the next action needs only the clock of the observation."""
         return not self.needs_observation()
 
-    def supports_rtc(self) -> bool:
-        """Return whether LeRobot's real-time chunking, which guides denoising, is possible; regression has none."""
-        return bool(super().supports_rtc()) and self.config.objective != REGRESSION
-
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Observe one frame per row, and return plans for all rows (B, chunk, A), normalised.
+    def predict_action_chunk(self, batch: dict[str, Tensor], noise: Tensor | None = None, **kwargs: Any) -> Tensor:
+        """Observe one frame per environment, and return plans for all of them (B, chunk, A), normalised.
 
         A policy with a memory must have observed every control step (`observe`), unless observations have a clock
         (``observation.step``); `select_action` observes by itself. A training batch has its own histories. ``noise``
-        (B, chunk, max_action_dim) replaces the episodes' own; other keywords are those of LeRobot's real-time chunking.
-        That passes one observation per chunk, which then also replaces the frames due since the last one.
-
-        Raises:
-            MemobenchError: observations were left out between two chunks; or real-time chunking with regression.
+        (B, chunk, max_action_dim) replaces the episodes' own.
         """
         self.eval()
-        if self._rtc_enabled() and self.config.objective == REGRESSION:
-            raise MemobenchError(
-                "real-time chunking guides denoising, which a policy with objective=regression lacks; use "
-                "--inference.type=sync, or train with --policy.objective=flow_matching."
-            )
-        noise = kwargs.pop("noise", None)
-        if PHASE in batch:  # a training batch
-            samples = range(len(batch[PHASE]))
-            if noise is None:
-                noise = self._noise(samples, lambda _, shape: torch.randn(shape))
-            return self.plan(batch, [*samples], noise, training=True, **kwargs)
-        if OBS_STEP in batch or not self._remembers or not self._calls or self._rtc_enabled():
-            self.observe(batch)
-        elif self._calls == self._planned:
-            raise MemobenchError(
-                "this policy needs the observation of every control step, and was asked for two plans without an "
-                "observation between them, so its memory would differ from training; pass every observation to "
-                "select_action (--inference.type=sync) or to observe, or train with --policy.memory=none."
-            )
-        self._planned = self._calls
-        rows = list(range(len(self.rollout.rows)))
-        return self.plan(batch, rows, self._noise(rows) if noise is None else noise, **kwargs)
+        if training := PHASE in batch:
+            rows = [*range(len(batch[PHASE]))]
+        else:
+            if OBS_STEP in batch or not self._remembers or not self._calls:
+                self.observe(batch)
+            elif self._calls == self._planned:
+                raise MemobenchError(
+                    "this policy needs the observation of every control step, and was asked for two plans without an "
+                    "observation between them, so its memory would differ from training; pass every observation to "
+                    "select_action (--inference.type=sync) or to observe, or train with --policy.memory=none."
+                )
+            self._planned = self._calls
+            rows = [*range(len(self.rollout.envs))]
+        return self.plan(batch, rows, self._noise(rows, training) if noise is None else noise, training)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -543,13 +448,10 @@ class MemobenchMemPolicy(PI05Policy):
 
         Args:
             dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-
-        Raises:
-            MemobenchError: weights do not fit, or, for evaluation, statistics are missing.
         """
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
-        path = weights_file(source, revision, named=f"The checkpoint '{source}'", fix="give a pretrained_model folder")
+        path = weights_file(source, revision)
         if dataset_meta is None:
             check_statistics(source, revision)
         # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.
@@ -579,7 +481,10 @@ class MemobenchMemPolicy(PI05Policy):
         return wrapped
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        return super()._get_default_peft_targets() | {"modules_to_save": self.trained_whole()}
+        """Return LeRobot's targets for pi0.5."""
+        projections = "action_in_proj|action_out_proj"
+        targets = rf"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj|model\.({projections}))"
+        return {"target_modules": targets, "modules_to_save": self.trained_whole()}
 
     def _preprocess_peft_cli_overrides(self, cli_overrides: dict[str, Any], peft_method_type: Any) -> dict[str, Any]:
         overrides: dict[str, Any] = super()._preprocess_peft_cli_overrides(cli_overrides, peft_method_type)

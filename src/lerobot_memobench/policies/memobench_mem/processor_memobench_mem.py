@@ -1,8 +1,4 @@
-"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, memory of training samples, tokenizers of prompts.
-
-A tokenizer is pretrained, or made of the words of the dataset's tasks. It warns about unknown words, and about prompts
-that it cuts off.
-"""
+"""Pre- and post-processing of ``memobench_mem``: pi0.5's steps, memory of training samples, tokenizers of prompts."""
 
 from __future__ import annotations
 
@@ -19,13 +15,11 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from lerobot.processor import (
-    AbsoluteActionsProcessorStep,
     ObservationProcessorStep,
     PolicyAction,
     PolicyProcessorPipeline,
     ProcessorStep,
     ProcessorStepRegistry,
-    RelativeActionsProcessorStep,
     TokenizerProcessorStep,
     make_default_policy_processor_steps,
     make_policy_processor_pipelines,
@@ -41,7 +35,6 @@ from torch.nn.utils.rnn import pad_sequence
 
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.memobench_mem.alignment import embedded_texts
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
@@ -53,10 +46,11 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     STEPS,
     SUBGOAL,
     SUBGOALS,
+    TEXT,
+    TEXT_MASK,
 )
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
-from lerobot_memobench.policies.memobench_mem.subgoals import choices, texts_of
-from lerobot_memobench.policies.memobench_mem.text_encoders import words
+from lerobot_memobench.policies.memobench_mem.texts import choices, texts_of, words
 from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
@@ -74,10 +68,9 @@ def make_memobench_mem_pre_post_processors(
     """Build both processors of a new policy (LeRobot's factory calls this unless it loads saved ones).
 
     Args:
-        dataset_stats: normalisation statistics of the training dataset.
-        dataset_meta: its metadata, whose task texts give the words of the word tokenizer. LeRobot 0.6.1 sets it as an
-            attribute of the config instead.
-        lookup: the frames of the training dataset; None in LeRobot's own trainer, and for a policy that only acts.
+        dataset_meta: metadata of the training dataset, whose task texts give the words of the word tokenizer. LeRobot
+            0.6.1 sets it as an attribute of the config instead.
+        lookup: its frames; None in LeRobot's own trainer, and for a policy that only acts.
 
     Raises:
         MemobenchError: there are no statistics, as for a policy that was never trained.
@@ -89,29 +82,18 @@ def make_memobench_mem_pre_post_processors(
         )
     meta = dataset_meta or getattr(config, "_runtime_dataset_meta", None)
     steps = make_default_policy_processor_steps(config, dataset_stats)
-    relative = RelativeActionsProcessorStep(
-        enabled=config.use_relative_actions,
-        exclude_joints=config.relative_exclude_joints,
-        action_names=config.action_feature_names,
-    )
     input_steps: list[ProcessorStep] = [
         steps.rename_observations,
         steps.add_batch_dim,
         GatherMemoryProcessorStep(config=config, lookup=lookup),
         OracleMemoryProcessorStep(enabled=config.oracle_memory, lookup=lookup),
-        relative,
         *([RawStateProcessorStep()] if config.uses_objects else []),
         steps.normalize,  # before the prompt, which may spell the normalised state
         *([] if config.state_token else [Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim)]),
         _tokenizer(config, prompt_texts(config, meta, lookup)),
         steps.to_device,
     ]
-    output_steps: list[ProcessorStep] = [
-        steps.unnormalize,
-        AbsoluteActionsProcessorStep(enabled=config.use_relative_actions, relative_step=relative),
-        steps.to_cpu,
-    ]
-    return make_policy_processor_pipelines(input_steps=input_steps, output_steps=output_steps)
+    return make_policy_processor_pipelines(input_steps=input_steps, output_steps=[steps.unnormalize, steps.to_cpu])
 
 
 def follow_training(steps: Iterable[Any], config: MemobenchMemConfig, meta: Any, lookup: FrameLookup) -> None:
@@ -153,15 +135,12 @@ class LookupProcessorStep(ProcessorStep):
     lookup: FrameLookup | None = field(default=None, repr=False, kw_only=True)
 
     def sample_indices(self, transition: EnvTransition) -> list[int] | None:
-        """Return the global indices of training samples; None in a rollout.
-
-        A transition of LeRobot keeps the ``index`` of training frames; rollouts have none.
-        """
+        """Return the global indices of training samples; None in a rollout, which has no ``index``."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return None
-        found: list[int] = extra["index"].reshape(-1).tolist()
-        return found
+        indices: list[int] = extra["index"].reshape(-1).tolist()
+        return indices
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -175,11 +154,9 @@ class LookupProcessorStep(ProcessorStep):
 class GatherMemoryProcessorStep(LookupProcessorStep):
     """Add history, phase and subgoal embeddings to training samples.
 
-    Training samples get ``memory.frames``, ``memory.steps`` and ``memory.places`` (`Histories`), ``phase`` (B,), and
-    features of the frames (``observation.encoded.*``). An alignment adds ``memory.text`` and ``memory.text_mask``:
-    (B, d_t) and (B,) of the frame itself, or with ``framewise`` (B, F, d_t) and (B, F) of the remembered frames. A
-    privileged memory adds the indices of the active texts, ``memory.subgoal`` (B,) of the samples and
-    ``memory.subgoals`` (U,) of the frames; a memory that learns to predict frames adds ``memory.ahead`` (B, n).
+    Training samples get the parts of their `Histories`, ``phase`` (B,), and features of the frames
+    (``observation.encoded.*``). An alignment adds ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) of the
+    frame itself, or with ``framewise`` (B, F, d_t) and (B, F) of the remembered frames.
 
     In a rollout, where the policy itself keeps the history, and in LeRobot's own trainer, only ``memory.choices``
     (B, S) is added: which texts of ``subgoals`` belong to the task.
@@ -193,8 +170,11 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
     config: MemobenchMemConfig | None = field(default=None, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.config is not None:
-            self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
+        if self.config is None:
+            return
+        self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
+        if self.config.memory != NONE:
+            self._settings = read_settings(self.config.memory, self.config.memory_settings)
 
     def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
         """Set the configuration and the frames of a training."""
@@ -202,7 +182,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition with the frames' history, phase and texts."""
+        """Add what `gather` returns."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if self.subgoals:
             extra = {**extra, CHOICES: choices(self.subgoals, extra.get("task") or [])}
@@ -222,19 +202,18 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         return transition
 
     def gather(self, lookup: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
-        """Look up frames of the dataset by their global indices."""
+        """Return what the class describes for frames of the dataset, by their global indices."""
         config = self.config
         assert config is not None
         places = [lookup.locate(index) for index in indices]
-        found = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
-        found |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
+        features = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
+        features |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
         if config.memory == NONE:
-            return found
-        mechanism, stride = find_mechanism(config.memory), lookup.stride
-        settings = read_settings(config.memory, config.memory_settings)
+            return features
+        mechanism, stride, settings = find_mechanism(config.memory), lookup.stride, self._settings
 
         def slots(episode: int, last: int) -> np.ndarray:
-            if config.memory_repeats:
+            if not config.skips_repeated_frames:
                 return np.asarray(mechanism.slots(last, settings))
             written = lookup.changes(episode)
             return written[mechanism.slots(int(np.searchsorted(written, last, "right")) - 1, settings)]
@@ -249,13 +228,15 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
             memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
         if config.align == "none":
-            return memory | found
-        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level))
-        if config.align != "framewise":
-            return memory | found | embedded_texts(lookup.text_embeddings, texts[torch.tensor([*indices])])
-        histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
-        padded = pad_sequence(histories, batch_first=True, padding_value=-1)
-        return memory | found | embedded_texts(lookup.text_embeddings, padded)
+            return memory | features
+        texts = torch.from_numpy(lookup.text_rows(config.subgoal_level)).long()
+        if config.align == "framewise":
+            histories = [texts[int(lookup.episodes[episode]) + read * stride] for episode, read in recalled]
+            asked_texts = pad_sequence(histories, batch_first=True, padding_value=-1)
+        else:
+            asked_texts = texts[torch.tensor([*indices])]
+        embedded = lookup.text_embeddings[asked_texts.clamp(min=0)]
+        return memory | features | {TEXT: embedded, TEXT_MASK: asked_texts >= 0}
 
     def get_config(self) -> dict[str, Any]:
         """Return the saved settings."""
@@ -267,8 +248,7 @@ def _histories(
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Load frames of episodes by their slots, each once; return them for a batch, and their indices in the dataset.
 
-    Args:
-        ahead: following slots of each sample, possibly beyond the episode's end.
+    The following slots of each sample, ``ahead``, may lie beyond the episode's end.
     """
     stride, needed = lookup.stride, dict[int, list[np.ndarray]]()
     counts = -(-np.diff(lookup.episodes) // stride)
@@ -279,17 +259,17 @@ def _histories(
     first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
 
     def places(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
-        found = np.full((len(wanted), width), -1)
+        indices = np.full((len(wanted), width), -1)
         for row, (episode, slots) in enumerate(wanted):
-            found[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
-        return torch.from_numpy(found)
+            indices[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
+        return torch.from_numpy(indices)
 
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
     starts = np.repeat([lookup.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
     frames = torch.cat([lookup.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
-    found = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
-    found |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
-    return found, steps + torch.from_numpy(starts)
+    histories = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
+    histories |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
+    return histories, steps + torch.from_numpy(starts)
 
 
 @dataclass
@@ -305,7 +285,7 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
     enabled: bool = True
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Return the transition with memory text in its tasks.
+        """Append the text.
 
         Raises:
             MemobenchError: a rollout's instruction has no memory text, or LeRobot's own trainer runs the step.
@@ -343,10 +323,9 @@ class RawStateProcessorStep(ObservationProcessorStep):
     """Copy the state (B, n), m and rad, to ``observation.raw_state`` before normalisation, for places of objects."""
 
     def observation(self, observation: dict) -> dict:
-        """Return the observation with a copy of its state."""
-        if OBS_STATE not in observation:
-            return observation
-        return observation | {OBS_RAW_STATE: observation[OBS_STATE].clone()}
+        """Copy the state."""
+        copied = {OBS_RAW_STATE: observation[OBS_STATE].clone()} if OBS_STATE in observation else {}
+        return observation | copied
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
@@ -355,7 +334,7 @@ class RawStateProcessorStep(ObservationProcessorStep):
         return features
 
 
-# -- tokenizers of text prompts ---------------------------------------------------------------------------------------
+# -- tokenizers of prompts --------------------------------------------------------------------------------------------
 
 _SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
 
@@ -392,14 +371,13 @@ def make_word_tokenizer(vocabulary: Sequence[str]) -> Any:
 
 
 _warned: set[str] = set()
-"""Texts, instructions and words about which this process has logged a warning."""
+"""Prompts, instructions and words about which this process has logged a warning."""
 
 
 def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
     """Warn about unknown words of a prompt, each once per process, and about cut prompts, once per instruction.
 
-    Args:
-        full: whether the prompt fills ``max_length`` tokens, so that it may have been cut.
+    A prompt that is ``full`` may have been cut.
     """
     prompt = text.partition(", State: ")[0]
     instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
@@ -407,27 +385,21 @@ def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> No
         return
     coded = tokenizer(text, return_offsets_mapping=True)
     spans = list(zip(coded["input_ids"], coded["offset_mapping"], strict=True))
-    unknown = dict.fromkeys(text[a:b].lower() for token, (a, b) in spans if token == tokenizer.unk_token_id)
-    new = [repr(word) for word in unknown if f"word {word}" not in _warned]
-    if new:
+    unknown = {text[a:b].lower(): None for token, (a, b) in spans if token == tokenizer.unk_token_id}
+    if new := [repr(word) for word in unknown if f"word {word}" not in _warned]:
         logger.warning(
             "unknown words %s in %r: the policy reads all unknown words alike; train it on instructions with these "
             "words",
-            ", ".join(new),
-            instruction,
+            *(", ".join(new), instruction),
         )
     if len(spans) > max_length and f"cut {instruction}" not in _warned:
         logger.warning(
-            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its "
-            "training); cut off: %r",
-            instruction,
-            len(spans),
-            max_length,
-            text[spans[max_length][1][0] :],
+            "the prompt of %r has %d tokens; the policy reads %d (policy.tokenizer_max_length of its training); cut "
+            "off: %r",
+            *(instruction, len(spans), max_length, text[spans[max_length][1][0] :]),
         )
         _warned.add(f"cut {instruction}")
-    _warned.update(f"word {word}" for word in unknown)
-    _warned.add(f"read {prompt}")
+    _warned.update([f"read {prompt}", *(f"word {word}" for word in unknown)])
 
 
 @dataclass
@@ -436,13 +408,14 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
     """LeRobot's tokenizer step with warnings about unknown words and cut prompts."""
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
-        found: dict[str, Tensor] = super()._tokenize_text(text)
+        encoded: dict[str, Tensor] = super()._tokenize_text(text)
         # Checked on token numbers first, because this runs at every control step. A full row may have been cut.
-        tokenizer, full = self.input_tokenizer, found["attention_mask"].bool().all(dim=-1)
-        unknown = (found["input_ids"] == (-1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id)).any(dim=-1)
+        tokenizer, full = self.input_tokenizer, encoded["attention_mask"].bool().all(dim=-1)
+        number = -1 if tokenizer.unk_token_id is None else tokenizer.unk_token_id
+        unknown = (encoded["input_ids"] == number).any(dim=-1)
         for row in (unknown | full).nonzero().flatten().tolist():
             warn_of_losses(tokenizer, text if isinstance(text, str) else text[row], self.max_length, bool(full[row]))
-        return found
+        return encoded
 
     def save_artifacts(self, save_directory: Path) -> dict[str, str]:
         """Save no tokenizer files: the settings hold the tokenizer's name or words."""

@@ -1,4 +1,4 @@
-"""Rows of a rollout: each keeps its memory, its action chunk and the seed of its noise, independent of other rows."""
+"""Environments of a rollout: each has its memory, its action chunk and the seed of its noise, independent of others."""
 
 from __future__ import annotations
 
@@ -20,18 +20,16 @@ STALLED, PER_RADIAN = 0.006, 0.1
 
 
 @dataclass
-class Row:
-    """The episode of one environment.
+class EnvMemory:
+    """The episode of one environment of a batch.
 
     Attributes:
         clock: phase and control step since the phase began. position: control step since the episode began.
         memory: state of the memory mechanism; None before the first frame. intact: its state before a corruption.
-        emptied: whether the next frame is the memory's first, after a corruption.
-        stored: the last frame that was written.
-        missed: step of the first frame that should have been written and was not observed; None: none.
+        emptied: whether the next frame is the memory's first, after a corruption. stored: the last written frame.
+        missed: step of the first frame that should have been written and was not observed.
         queue: remaining planned actions. last: the last action (A,).
-        pose: of the hand when the last chunk was planned, and skipped: actions of that chunk that were left out
-            (`begin_chunk`).
+        pose: of the hand when the last chunk was planned. skipped: actions of that chunk that were left out.
         reads: memory reads of the episode's chunks, if they are watched.
     """
 
@@ -58,9 +56,9 @@ class Row:
     def begin_chunk(self, chunk: Tensor, count: int, state: Tensor | None = None) -> None:
         """Queue the first ``count`` actions of a chunk (n, A), or the following ones if the hand has stalled.
 
-        A hand that replans the same action after too few steps could stall forever. A hand whose pose is the same bit
-        for bit has not stalled: the environment holds it, or it rests. A plan has ``count`` actions in all cases, as
-        the policy declares to the environment, so that plans stay in step with its holds.
+        A hand that replans the same action after too few steps could stall forever. A hand whose pose is bit-identical
+        has not stalled: the environment holds it, or it rests. A plan has ``count`` actions in all cases, as the policy
+        declares to the environment, so that plans stay in step with its holds.
 
         Args:
             state: the robot's state (8,), m and rad, to compare with that of the last chunk; None: never stalled.
@@ -87,99 +85,69 @@ class Row:
 
 
 class Rollout:
-    """The rows of a vector environment.
+    """The environments of a vector environment, of which every ``stride``-th frame is written, if any (``remembers``).
 
-    A row detects by its clock that an episode begins or has ended (`begins_episode`, `is_frozen`). If observations have
-    no clock, each observation is a control step.
-
-    Args:
-        remembers: whether frames are written.
-        stride: control steps between written frames; an episode's first frame is always written.
-
-    Attributes:
-        late: whether the next observed frame replaces frames that were due and not observed.
+    The clock of an environment shows that an episode begins or has ended (`begins_episode`, `is_frozen`). An episode's
+    first frame is always written. If observations have no clock, each observation is a control step.
     """
 
     def __init__(self, remembers: bool, stride: int) -> None:
-        self.remembers, self.stride, self.late = remembers, stride, False
-        self.reset()
+        self.remembers, self.stride = remembers, stride
+        self.envs: list[EnvMemory] = []
 
-    def reset(self) -> None:
-        """Forget everything."""
-        self.rows: list[Row] = []
+    def observe(self, clocks: Sequence[tuple[int, int]], write: Callable[[list[int]], None]) -> list[bool]:
+        """Process one observation per environment; return in which of them a new episode began.
 
-    def observe(
-        self, clocks: Sequence[tuple[int, int]], write: Callable[[list[int]], None]
-    ) -> tuple[list[int], list[bool], list[bool]]:
-        """Process one observation per row.
-
-        Args:
-            clocks: phase (0 prompt, 1 execution) of each row, and the control step since the phase began.
-            write: writes the frames of given rows; called at most once.
-
-        Returns:
-            Per row: the control step since the episode began, prompt included; whether a new episode began; and
-            whether the row is frozen.
+        ``clocks`` holds the phase (0 prompt, 1 execution) of each, and the control step since the phase began.
+        ``write`` writes the frames of given environments; it is called at most once.
         """
-        if len(self.rows) != len(clocks):
-            self.rows = [Row() for _ in clocks]
-        before = [row.position for row in self.rows]
-        started = [self._tick(row, clock) for row, clock in enumerate(clocks)]
-        for held, begins, last in zip(self.rows, started, before, strict=True):
-            due = (last // self.stride + 1) * self.stride  # the next written step
-            if not begins and due < held.position and held.missed is None and not self.late:
-                held.missed = due
-        steps, frozen = [row.position for row in self.rows], [row.frozen for row in self.rows]
-        written = [
-            begins
-            or held.emptied
-            or step % self.stride == 0
-            or (self.late and step // self.stride > last // self.stride)
-            for held, begins, step, last in zip(self.rows, started, steps, before, strict=True)
-        ]
-        wanted = [row for row, writes in enumerate(written) if writes and not frozen[row]]
-        if wanted and self.remembers:
-            write(wanted)
-        for row in wanted:
-            self.rows[row].emptied = False
-        return steps, started, frozen
+        if len(self.envs) != len(clocks):
+            self.envs = [EnvMemory() for _ in clocks]
+        before = [env.position for env in self.envs]
+        started = [self._tick(number, clock) for number, clock in enumerate(clocks)]
+        due = list[int]()
+        for number, (env, begins, last) in enumerate(zip(self.envs, started, before, strict=True)):
+            following = (last // self.stride + 1) * self.stride  # the next written step
+            if not begins and following < env.position and env.missed is None:
+                env.missed = following
+            if not env.frozen and (begins or env.emptied or env.position % self.stride == 0):
+                due.append(number)
+                env.emptied = False
+        if due and self.remembers:
+            write(due)
+        return started
 
     def _tick(self, number: int, clock: tuple[int, int]) -> bool:
-        """Set a row's clock; return whether a new episode began."""
-        row, step = self.rows[number], clock[1]
-        last = row.clock
+        env, step = self.envs[number], clock[1]
+        last = env.clock
         if begins_episode(last, clock):
-            self.rows[number] = Row(clock, max(step, 0))
+            self.envs[number] = EnvMemory(clock, max(step, 0))
             return True
         assert last is not None  # else an episode begins
-        row.clock, row.frozen = clock, is_frozen(last, clock)
-        if not row.frozen:  # the execution's clock starts at 0, continues the prompt's, or is missing
-            row.position += step - last[1] if step > last[1] >= 0 else 1 + max(step, 0)
+        env.clock, env.frozen = clock, is_frozen(last, clock)
+        if not env.frozen:  # the execution's clock starts at 0, continues the prompt's, or is missing
+            env.position += step - last[1] if step > last[1] >= 0 else 1 + max(step, 0)
         return False
 
-    def corrupt(self, rows: Sequence[int], changed: Callable[[int], Any]) -> None:
-        """Replace the memories of rows.
+    def corrupt(self, numbers: Sequence[int], changed: Callable[[int], Any]) -> None:
+        """Replace the memories of environments by ``changed``; None: a memory begins with its next frame."""
+        for number in numbers:
+            self.envs[number].intact = self.envs[number].memory
+        for number in numbers:
+            self.envs[number].memory = changed(number)
+            self.envs[number].emptied = self.envs[number].memory is None
 
-        Args:
-            changed: returns the new memory of a row; None: the row begins with its next frame, as an episode does.
-        """
-        for row in rows:
-            self.rows[row].intact = self.rows[row].memory
-        for row in rows:
-            self.rows[row].memory = changed(row)
-            self.rows[row].emptied = self.rows[row].memory is None
-
-    def of_next(self, row: int) -> Any:
-        """Return the memory of the next row of the batch, as it was before a corruption."""
-        other = self.rows[(row + 1) % len(self.rows)]
+    def next_env_memory(self, number: int) -> Any:
+        """Return the memory of the next environment of the batch, as it was before a corruption."""
+        other = self.envs[(number + 1) % len(self.envs)]
         return other.memory if other.intact is None else other.intact
 
     def writes_next(self) -> bool:
-        """Return whether the next frame of any row will be written."""
-        moving = [row.position for row in self.rows if row.clock is not None and not row.frozen]
+        """Return whether the next frame of any environment will be written."""
+        moving = [env.position for env in self.envs if env.clock is not None and not env.frozen]
         return self.remembers and any((step + 1) % self.stride == 0 for step in moving)
 
-    def missed(self, rows: Sequence[int]) -> int | None:
-        """Return the first step of these rows that should have been written and was not observed; None: none."""
-        steps = (self.rows[row].missed for row in rows)
+    def missed(self, numbers: Sequence[int]) -> int | None:
+        """Return the first step that should have been written and was not observed in these environments."""
+        steps = (self.envs[number].missed for number in numbers)
         return min((step for step in steps if step is not None), default=None)

@@ -23,7 +23,7 @@ logger = logging.getLogger(__name__)
 GROUP = "lerobot_memobench.memories"
 NONE = "none"
 OURS = {
-    "frames": "Frames",
+    "frames": "FrameSampling",
     "bank": "Bank",
     "motion": "Motion",
     "subgoal": "Subgoal",
@@ -46,30 +46,31 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
     Raises:
         MemobenchError: the name is unknown or ambiguous, or the package that adds it is broken.
     """
-    found = [point for point in entry_points(group=GROUP) if point.name == name]
+    points = [point for point in entry_points(group=GROUP) if point.name == name]
     if name in OURS:
-        for point in found:
+        for point in points:
             logger.warning("the memory '%s' of a package (%s) is ignored: it has the name of ours", name, point.value)
-        found = [EntryPoint(name, f"{__name__}.{name}:{OURS[name]}", GROUP)]
-    if not found:
+        points = [EntryPoint(name, f"{__name__}.{name}:{OURS[name]}", GROUP)]
+    if not points:
         known = [NONE, *mechanism_names()]
         raise MemobenchError(f"unknown memory '{name}': {nearest(name, known)} Pass --policy.memory=<one of them>.")
-    if len({point.value for point in found}) > 1:
-        classes = " and ".join(sorted(point.value for point in found))
+    if len({point.value for point in points}) > 1:
+        classes = " and ".join(sorted(point.value for point in points))
         raise MemobenchError(f"several memories '{name}' ({classes}); remove a package, or rename its entry point.")
     try:
-        made = found[0].load()
+        mechanism = points[0].load()
     except Exception as error:
         raise MemobenchError(
-            f"the memory '{name}' ({found[0].value}) cannot be imported: {type(error).__name__}: {error}; repair or "
+            f"the memory '{name}' ({points[0].value}) cannot be imported: {type(error).__name__}: {error}; repair or "
             "remove its package."
         ) from error
-    if not (isinstance(made, type) and issubclass(made, MemoryMechanism) and is_dataclass(made.Settings)):
+    fits = isinstance(mechanism, type) and issubclass(mechanism, MemoryMechanism)
+    if not (fits and is_dataclass(mechanism.Settings)):
         raise MemobenchError(
-            f"the memory '{name}' ({found[0].value}) is no subclass of MemoryMechanism "
+            f"the memory '{name}' ({points[0].value}) is no subclass of MemoryMechanism "
             "(lerobot_memobench.policies.memobench_mem.memory.mechanism) with a dataclass as its Settings."
         )
-    return made
+    return mechanism
 
 
 def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:

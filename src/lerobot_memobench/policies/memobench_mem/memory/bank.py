@@ -3,19 +3,7 @@
 This is the variant of Dexbotic's MemoryVLA+ with two streams: perceptual, the P tokens of a frame, and cognitive, one
 token. The tokens of a frame retrieve from the entries of their stream, are fused with the result by a gate, and become
 an entry; when the stream is full, its two most similar neighbours are merged. An action chunk reads the present, fused
-in the same way.
-
-Differences from the source:
-
-- The cognitive token of the source is the language model's last prompt state, which would need a pass of the backbone
-  per frame; here it is made by one layer, in which a learned token attends to the frame's tokens. It reads no words.
-- The squeeze-excite bottleneck of the perceptual stream is a Linear to the same 256 channels after the pooling.
-- The fused tokens are memory tokens, read by ``memory_fusion``; the source has a diffusion transformer with its own
-  condition and cross-attention.
-- Frames are written at a fixed stride instead of at the beginning of chunks, so a chunk that begins at such a step
-  finds its own frame among the entries. Times are control steps; the source trains with frames and acts with calls.
-- Each row has its own bank, and there is no dropout. The source shares one bank between rows of a rollout, and applies
-  dropout in rollouts as well.
+in the same way. `docs/guides/memory/bank.md` lists the differences from the source.
 """
 
 from __future__ import annotations
@@ -41,11 +29,7 @@ WAVES, TIME_BASE = 128, 10_000.0
 
 @dataclass
 class BankSettings:
-    """Settings of `Bank`.
-
-    Attributes:
-        length: maximum number of entries per stream.
-    """
+    """Settings of `Bank`: the maximum number of entries per stream."""
 
     length: int = 16
 
@@ -73,7 +57,7 @@ class Bank(MemoryMechanism):
         self.reduce = nn.Linear(spec.dim, widths["perceptual"])
         self.asking = nn.Parameter(torch.randn(1, 1, spec.dim))
         self.summary = Lookup(spec.dim)
-        self.streams = nn.ModuleDict({name: Stream(width) for name, width in widths.items()})
+        self.streams = nn.ModuleDict({name: BankStream(width) for name, width in widths.items()})
         self.out = nn.ModuleDict({name: nn.Linear(width, spec.width) for name, width in widths.items()})
 
     def _present(self, tokens: Tensor) -> dict[str, Tensor]:
@@ -133,21 +117,18 @@ class Lookup(nn.Module):
         """Return tokens (R, N, d) after attention to M others, and the attention weights (R, heads N, M).
 
         The projections of keys and values (R, M, d) are applied to the query and to the weighted sum instead: the
-        products are the same, and there are many times more keys than queries.
-
-        Args:
-            hidden: (R, M) bool, keys that are masked out.
+        products are the same, and there are many times more keys than queries. ``hidden`` (R, M) are masked out.
         """
         of_key, of_value = (one.weight.unflatten(0, (HEADS, -1)) for one in (self.key, self.value))
         query = torch.einsum("rnhe,hed->rhnd", self.query(asking).unflatten(2, (HEADS, -1)), of_key).flatten(1, 2)
         scores = torch.bmm(query, keys.transpose(1, 2)) * of_key.shape[1] ** -0.5
         weights = scores.masked_fill(hidden[:, None], -torch.inf).softmax(dim=2)
-        found = torch.bmm(weights, values).unflatten(1, (HEADS, -1))
-        asking = self.norms[0](asking + torch.einsum("rhnd,hed->rnhe", found, of_value).flatten(2))
+        read = torch.bmm(weights, values).unflatten(1, (HEADS, -1))
+        asking = self.norms[0](asking + torch.einsum("rhnd,hed->rnhe", read, of_value).flatten(2))
         return self.norms[1](asking + self.mlp(asking)), weights
 
 
-class Stream(nn.Module):
+class BankStream(nn.Module):
     """Retrieval from the entries of a stream, and the gate of the result."""
 
     def __init__(self, width: int) -> None:
@@ -162,15 +143,10 @@ class Stream(nn.Module):
     def forward(
         self, present: Tensor, entries: Tensor, steps: Tensor, count: Tensor, now: Tensor
     ) -> tuple[Tensor, list[Tensor]]:
-        """Return the present fused with its retrieval from the entries, or from itself if there are no entries.
+        """Return the present (R, N, d) fused with its retrieval from the entries, or from itself without entries.
 
-        Args:
-            present: (R, N, d). entries: (R, L, N, d); the first ``count`` (R,) are real. steps: (R, L).
-            now: (R,) step of the present.
-
-        Returns:
-            (R, N, d), and for each block the attention of its heads to the tokens of the entries and then of the
-            present: (R, heads N, (L + 1) N).
+        The first ``count`` (R,) of the entries (R, L, N, d) are real. Also returns for each block the attention of its
+        heads to the tokens of the entries and then of the present: (R, heads N, (L + 1) N).
         """
         slots = torch.arange(entries.shape[1] + 1, device=count.device)
         hidden = torch.where(slots < slots[-1], slots >= count[:, None], count[:, None] > 0)
@@ -178,12 +154,12 @@ class Stream(nn.Module):
         values = torch.cat([entries, present[:, None]], dim=1)
         keys = values + self.time(waves(torch.cat([steps, now[:, None]], dim=1)))[:, :, None]
         keys, values = keys.flatten(1, 2), values.flatten(1, 2)
-        found, looked = present, []
+        retrieved, looked = present, []
         for block in self.blocks:
-            found, weights = block(found, keys, values, hidden)
+            retrieved, weights = block(retrieved, keys, values, hidden)
             looked.append(weights)
-        gate = self.gate(torch.cat([present, found], dim=2)).sigmoid()
-        return gate * present + (1 - gate) * found, looked
+        gate = self.gate(torch.cat([present, retrieved], dim=2)).sigmoid()
+        return gate * present + (1 - gate) * retrieved, looked
 
 
 def shares_of(looked: list[Tensor], tokens: int) -> Tensor:
@@ -201,15 +177,10 @@ def waves(steps: Tensor) -> Tensor:
 
 
 def append(entries: Tensor, steps: Tensor, count: Tensor, new: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
-    """Append an entry; in a full row, replace the two most similar neighbours by their mean.
+    """Append an entry (R, N, d) to the entries (R, L, N, d); return entries and their steps (R, L).
 
-    Similarity is the cosine of the tokens at the same place, averaged over the places.
-
-    Args:
-        entries: (R, L, N, d). steps: (R, L). count: (R,), number of entries. new: (R, N, d). now: (R,), its step.
-
-    Returns:
-        Entries and steps.
+    In a full row, the two most similar neighbours are replaced by their mean. Similarity is the cosine of the tokens at
+    the same place, averaged over the places.
     """
     length = entries.shape[1]
     entries, steps = torch.cat([entries, new[:, None]], dim=1), torch.cat([steps, now[:, None].to(steps)], dim=1)

@@ -32,9 +32,8 @@ class FastWeights(MemoryMechanism):
     y = R(q W + b) + q, and the token's output is x + LN_post(y) W_o. A chunk reads the outputs of the last 8 frames;
     earlier frames are kept in W and b only.
 
-    Unlike in the source, W and b are carried over from one remembered frame to the next; the source learns them again
-    from the last 64 frames at each chunk. Gradients of training pass through the last ``gradient_frames``; in the
-    source, through all 64. A frame has this policy's tokens (2 of objects, 16 of a picture; 64 in the source).
+    Unlike in the source, W and b are carried over from one remembered frame to the next.
+    `docs/guides/memory/fast_weights.md` lists all differences.
     """
 
     Settings = RecurrenceSettings
@@ -96,12 +95,9 @@ class FastWeights(MemoryMechanism):
         }
 
     def _learned(self, weight: Tensor, bias: Tensor, key: Tensor, value: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step.
+        """Return the weights (R, H, d, d) and biases (R, H, 1, d) after one step on keys and values (R, H, P, d).
 
         Its gradients are written out: it needs no autograd in a rollout, and training differentiates through it.
-
-        Args:
-            key, value: (R, H, P, d). rate: (R, H, P, 1).
         """
         made, (unit, root) = self._normed(key @ weight + bias)
         error = (made - (value - key)) * (1 + self.scale)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +18,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     MemorySpec,
     MemoryTokens,
     Query,
+    State,
     with_noise,
 )
 from lerobot_memobench.policies.memobench_mem.objects import ObjectPool
@@ -41,7 +41,7 @@ def sample_frames(step: int, max_frames: int) -> list[int]:
 
 
 @dataclass(eq=False)
-class Frame:
+class RememberedFrame:
     """A remembered frame.
 
     Attributes:
@@ -56,19 +56,12 @@ class Frame:
     noise: int | None = None
 
 
-def noisy(tokens: Tensor, seed: int | None) -> Tensor:
-    """Return the memory tokens (P, d_m) of a frame, with noise if there is a seed."""
-    return tokens if seed is None else with_noise(tokens, torch.Generator().manual_seed(seed))
-
-
 @dataclass
-class FramesSettings:
-    """Settings of `Frames`.
+class FrameSamplingSettings:
+    """Settings of `FrameSampling`: the most ``frames`` that a chunk reads, and whether tokens have ``content``.
 
-    Attributes:
-        frames: maximum number of frames that a chunk reads.
-        content: whether tokens hold the observation. If false, they hold only their time: the clock-only control of
-            `docs/guides/controls.md`; with ``memory_phase``, also the phase.
+    Without content they hold only their time: the clock-only control of `docs/guides/controls.md`; with
+    ``memory_phase``, also the phase.
     """
 
     frames: int = 32
@@ -79,38 +72,38 @@ class FramesSettings:
             raise ValueError(f"frames={self.frames} must be at least 1")
 
 
-class Frames(MemoryMechanism):
+class FrameSampling(MemoryMechanism):
     """FrameSamp of RoboMME's pi0.5: a chunk reads F of the stored frames, spread evenly, each token with its time.
 
     Every frame is stored, because each new frame changes the selection; of a very long episode, the latest `capacity`.
     Frames are kept as returned by the encoder, and pooled when they are read.
     """
 
-    Settings = FramesSettings
+    Settings = FrameSamplingSettings
     per_frame = True
     capacity = 8192  # 512 MiB at size pi05, 32 MiB at tiny; with every frame remembered, seven minutes at 20 Hz
 
-    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: FramesSettings) -> None:
+    def __init__(self, spec: MemorySpec, pool: nn.Module, settings: FrameSamplingSettings) -> None:
         super().__init__(spec, pool, settings)
         self.encoder = MemoryEncoder(spec.dim, spec.width, spec.grid)
         self.warned = False
 
     @classmethod
-    def slots(cls, slot: int, settings: FramesSettings) -> Sequence[int]:
+    def slots(cls, slot: int, settings: FrameSamplingSettings) -> Sequence[int]:
         """Return the sampled frames."""
         first = max(0, slot + 1 - cls.capacity)
         return [first + chosen for chosen in sample_frames(slot - first, settings.frames)]
 
-    def init(self, rows: int) -> list[list[Frame]]:
+    def init(self, rows: int) -> State:
         """Return no frames."""
         return [[] for _ in range(rows)]
 
-    def observe(self, state: Any, frames: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Store the frames."""
-        return self.write(state, frames, step)
+    def pooled(self, frames: Tensor) -> Tensor:
+        """Return the stored frames, which are pooled when they are read."""
+        return frames
 
-    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> list[list[Frame]]:
-        """Store the frames without pooling."""
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+        """Store the frames."""
         if not self.warned and any(len(row) == self.capacity for row in state):
             self.warned = True
             logger.warning(
@@ -118,10 +111,10 @@ class Frames(MemoryMechanism):
                 "episode begins.",
                 self.capacity,
             )
-        new = [Frame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
+        new = [RememberedFrame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
         return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
 
-    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the encoded sampled frames of each row, padded to F."""
         count, device = self.settings.frames, self.encoder.project.weight.device
         rows = [[kept[slot] for slot in sample_frames(len(kept) - 1, count)] for kept in state]
@@ -131,28 +124,30 @@ class Frames(MemoryMechanism):
         places[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
         places, steps, real = places.to(device), steps.to(device), real.to(device)
         each = self._each(read, steps)
-        if any(frame.noise is not None for frame in read):
-            each = torch.stack([noisy(tokens, frame.noise) for tokens, frame in zip(each, read, strict=True)])
+        for number, frame in enumerate(read):
+            if frame.noise is not None:
+                each = each.clone()
+                each[number] = with_noise(each[number], torch.Generator().manual_seed(frame.noise))
         return self._tokens(each[places].flatten(1, 2), real, steps[places])
 
-    def _each(self, read: list[Frame], steps: Tensor) -> Tensor:
+    def _each(self, read: list[RememberedFrame], steps: Tensor) -> Tensor:
         """Return the memory tokens (N, P, d_m) of frames; tokens of objects are computed once per frame."""
         new = [number for number, frame in enumerate(read) if frame.tokens is None]
         made = [frame.tokens for frame in read]
         if new:
             stored = torch.stack([read[number].stored for number in new]).to(steps.device)
-            tokens = self._encoded(self._pooled(stored).unsqueeze(1), steps[new, None]).squeeze(1)
+            tokens = self._encoded(stored, steps[new])
             if not isinstance(self.pool, ObjectPool):
                 return tokens
             for number, made[number] in zip(new, tokens, strict=True):
                 read[number].tokens = made[number]
         return torch.stack(made)  # type: ignore[arg-type]  # none is None now
 
-    def join(self, states: Sequence[Any]) -> list[list[Frame]]:
+    def join(self, states: Sequence[State]) -> State:
         """Concatenate the rows of several states."""
         return [row for state in states for row in state]
 
-    def noised(self, state: Any, generator: torch.Generator) -> list[list[Frame]]:
+    def noised(self, state: State, generator: torch.Generator) -> State:
         """Return the frames with noise on their memory tokens."""
         seed = generator.initial_seed()
         return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
@@ -161,20 +156,18 @@ class Frames(MemoryMechanism):
         """Encode each frame once for all samples that read it."""
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
-        each = self._encoded(self._pooled(histories.frames).unsqueeze(1), histories.steps[:, None]).squeeze(1)
-        found = self._tokens(each, real, histories.steps[places])
-        return found._replace(places=places)
+        each = self._encoded(histories.frames, histories.steps)
+        tokens = self._tokens(each, real, histories.steps[places])
+        return tokens._replace(places=places)
 
-    def _pooled(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, P, D) of stored frames (N, P', D'); without content, zeros or the phase."""
+    def _encoded(self, frames: Tensor, steps: Tensor) -> Tensor:
+        """Return memory tokens (N, P, d_m) of stored frames (N, P', D') at control steps (N,)."""
         if not self.settings.content and isinstance(self.pool, ObjectPool) and self.pool.phase is not None:
-            return self.pool.phases(frames)
-        tokens: Tensor = self.pool(frames)
-        return tokens if self.settings.content else torch.zeros_like(tokens)
-
-    def _encoded(self, tokens: Tensor, steps: Tensor) -> Tensor:
-        """Return memory tokens (B, F, P, d_m) of tokens (B, F, P, D) at control steps (B, F)."""
-        encoded: Tensor = self.encoder(tokens, steps)
+            tokens = self.pool.phases(frames)
+        else:
+            tokens = self.pool(frames)
+            tokens = tokens if self.settings.content else torch.zeros_like(tokens)
+        encoded: Tensor = self.encoder(tokens.unsqueeze(1), steps[:, None]).squeeze(1)
         return encoded
 
     def _tokens(self, each: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:

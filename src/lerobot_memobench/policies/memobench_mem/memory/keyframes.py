@@ -34,10 +34,7 @@ LAYERS, HEADS = 2, 8
 
 
 def representatives(nominated: Sequence[int], gap: int) -> list[int]:
-    """Return the low median of each cluster of nominated frames, ascending.
-
-    A cluster ends when the next nomination is more than ``gap`` away. A frame counts once per nomination.
-    """
+    """Return the low median of each cluster of nominations, ascending; a gap above ``gap`` separates clusters."""
     clusters: list[list[int]] = []
     for frame in sorted(nominated):
         if not clusters or frame - clusters[-1][-1] > gap:
@@ -47,11 +44,7 @@ def representatives(nominated: Sequence[int], gap: int) -> list[int]:
 
 
 def shown(nominated: Sequence[int], gap: int, window: int) -> list[int]:
-    """Return the keyframes to show: the last representatives before the recent window.
-
-    Args:
-        window: the oldest recent frame.
-    """
+    """Return the keyframes to show: the last representatives before ``window``, the oldest recent frame."""
     return [frame for frame in representatives(nominated, gap)[-SHOWN:] if frame < window]
 
 
@@ -60,13 +53,8 @@ class Keyframes(MemoryMechanism):
 
     A frame is written every 10 control steps (2 Hz), and the high level runs for each; the recent window spans 4 s. A
     keyframe's label is the last written frame before a checkpoint is completed. The high level learns from true
-    keyframes, clustered as in a rollout, with some dropped or shifted, unlike in the source. Its target is the
-    checkpoint that is active at the next frame, on which the low level acts as well.
-
-    Differences from the source: the high level is no VLM but a small transformer over the frames' tokens, trained from
-    scratch; it chooses from the task's texts, which also identify the task, and has a logit per recent frame. The low
-    level reads the text in addition to the instruction. The latest 64 nominated frames are kept instead of all. Weights
-    are not merged with earlier ones.
+    keyframes, clustered as in a rollout, with some dropped or shifted. Its target is the checkpoint that is active at
+    the next frame, on which the low level acts as well. `docs/guides/memory/keyframes.md` lists the differences.
     """
 
     stride = 10
@@ -95,9 +83,7 @@ class Keyframes(MemoryMechanism):
     def ask_high_level(self, frames: Tensor, real: Tensor, choices: Tensor) -> tuple[Tensor, Tensor]:
         """Return scores (B, S + 1) of the checkpoints, and logits (B, RECENT) for nominating the recent frames.
 
-        Args:
-            frames: (B, SHOWN + RECENT, P, D) keyframes and recent frames, each the latest last.
-            real: (B, SHOWN + RECENT), False for padding. choices: (B, S), which texts belong to the task.
+        ``frames`` (B, SHOWN + RECENT, P, D) are keyframes, then recent frames, each the latest last.
         """
         tokens = self.embed(frames.to(self.embed.weight.dtype)) + self.place + self.spot
         task = self.task(choices.to(tokens.dtype)).unsqueeze(1)
@@ -147,7 +133,6 @@ class Keyframes(MemoryMechanism):
         }
 
     def _shown(self, kept: Tensor, kept_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the keyframes (R, SHOWN, P, D) to show, and their mask."""
         chosen = torch.full((len(kept), SHOWN), -1)
         for row, (steps, counts, recent) in enumerate(
             zip(kept_at.tolist(), votes.tolist(), recent_at.tolist(), strict=True)
@@ -192,13 +177,8 @@ class Keyframes(MemoryMechanism):
     def _true_frames(self, labels: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
         """Return the frames shown to the high level in training, and which recent frames it should nominate.
 
-        A frame is a keyframe if the next frame has another label: a checkpoint is completed between them.
-
-        Args:
-            labels: (B, F) of the histories' frames. counts: (B,) numbers of these frames.
-
-        Returns:
-            (B, SHOWN + RECENT) indices in the histories, -1 for padding; (B, RECENT) bool.
+        These are indices (B, SHOWN + RECENT) in the histories, -1 for padding, and bool (B, RECENT). A frame is a
+        keyframe if the next frame has another label (B, F): a checkpoint is completed between them.
         """
         device, size = labels.device, labels.shape[1]
         within = torch.arange(1, size, device=device) < counts.unsqueeze(1)
@@ -217,5 +197,5 @@ class Keyframes(MemoryMechanism):
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the losses of the last replay with labels, for the checkpoint and for the keyframes."""
-        found, self._losses = self._losses, {}
-        return found
+        losses, self._losses = self._losses, {}
+        return losses

@@ -26,12 +26,8 @@ OBJECT_TOKENS = 2
 
 # -- keys of a batch --------------------------------------------------------------------------------------------------
 
-FRAMES, STEPS, PLACES = "memory.frames", "memory.steps", "memory.places"
-"""Histories of a training batch: see `Histories`."""
-EXACT = "memory.exact"
-"""The remembered frames without detection noise."""
-AHEAD = "memory.ahead"
-"""Frames that follow the histories, for mechanisms that learn to predict them (`MemoryMechanism.ahead`)."""
+FRAMES, STEPS, PLACES, EXACT, AHEAD = (f"memory.{name}" for name in ("frames", "steps", "places", "exact", "ahead"))
+"""Parts of the `Histories` of a training batch."""
 SUBGOAL, SUBGOALS, CHOICES = "memory.subgoal", "memory.subgoals", "memory.choices"
 """For mechanisms that learn from texts (`MemoryMechanism.privileged`): the index of the active text, -1 for none, of
 each sample (B,) and of each frame (U,); and which texts belong to the sample's task, (B, S) bool, also in rollouts."""
@@ -101,9 +97,9 @@ class MemoryTokens(NamedTuple):
     sources: tuple[Tensor, Tensor] | None = None
     query: Query | None = None
 
-    def through(self, made: Callable[[Tensor], Tensor]) -> MemoryTokens:
+    def map(self, module: Callable[[Tensor], Tensor]) -> MemoryTokens:
         """Apply a module to each token."""
-        return self._replace(each=made(self.each))
+        return self._replace(each=module(self.each))
 
     def rows(self) -> Tensor:
         """Return the tokens of each row, (B, L, d)."""
@@ -152,7 +148,7 @@ class MemoryMechanism(nn.Module, ABC):
         Settings: a dataclass of the settings (``policy.memory_settings``), each with a default.
         stride: default number of control steps between written frames, or one per perception; None: as `frames`.
         asks_present: whether `read` needs tokens of the present observation.
-        asks_motion: whether the memory stores motion: its pool is a `motion_fields.MotionField`, and a stored picture
+        asks_motion: whether the memory stores motion: its pool is a `motion.MotionField`, and a stored picture
             is a thumbnail.
         ahead: number of following frames that training loads as labels.
         privileged: whether it learns from texts of checkpoints. A rollout gets the texts of its task, in no order.
@@ -184,6 +180,12 @@ class MemoryMechanism(nn.Module, ABC):
         """
         super().__init__()
         self.spec, self.pool, self.settings = spec, pool, settings
+
+    @classmethod
+    def make_pool(cls, observations: Any, spec: MemorySpec) -> nn.Module:
+        """Return the pool for the stored frames of an `encoders.ObservationEncoder`."""
+        pool: nn.Module = observations.pool()
+        return pool
 
     # -- a rollout ---------------------------------------------------------------------------------------------------
 
@@ -230,11 +232,7 @@ class MemoryMechanism(nn.Module, ABC):
 
     @classmethod
     def slots(cls, slot: int, settings: Any) -> Sequence[int]:
-        """Return which of an episode's frames 0 ... ``slot`` training loads to read at the last; by default all.
-
-        Args:
-            settings: an instance of `Settings`.
-        """
+        """Return which of an episode's frames 0 ... ``slot`` training loads to read at the last; by default all."""
         return range(slot + 1)
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
@@ -253,21 +251,18 @@ class MemoryMechanism(nn.Module, ABC):
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
         with torch.no_grad():
-            state = self._before(histories, begin, query)
+            state = self._state_before(histories, begin, query)
         if not self.gradient_frames:
             return state
         fresh = self.init(len(begin))  # with gradients, for samples without earlier frames
         early = begin == 0
         state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
-        ahead = begin[:, None] + torch.arange(int((count - begin).max()), device=begin.device)
+        left = count - begin
+        ahead = begin[:, None] + torch.arange(int(left.max()), device=begin.device)
         places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
-        order = (count - begin).argsort(descending=True, stable=True)  # finished rows are dropped from the end
-        written = self._written(
-            _rows(state, order), histories, places[order], (count - begin)[order], _of(query, order)
-        )
-        return _rows(self.join(written[::-1]), order.argsort())
+        return self._written(state, histories, places, query, left, torch.arange(len(left), device=left.device))
 
-    def _before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
+    def _state_before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
         """Return the states of B samples, each after the first ``begin`` (B,) frames of its history.
 
         Each episode is written once, up to its latest sample.
@@ -277,60 +272,39 @@ class MemoryMechanism(nn.Module, ABC):
         latest = torch.zeros_like(first)
         ends = begin == until[episode]
         latest[episode[ends]] = ends.nonzero().flatten()  # the latest sample of each episode
-        order = until.argsort(descending=True, stable=True)
-        samples, row_of = latest[order], order.argsort()[episode]
         read = torch.arange(histories.places.shape[1], device=begin.device) < begin[:, None]
         if ((histories.places != histories.places[latest[episode]]) & read).any():
             raise ValueError(
                 f"{type(self).__name__}.slots returns different sequences for samples of one episode with the same "
                 "first frame; the default replay needs prefixes of one sequence, so define your own replay"
             )
-        stops: dict[int, list[int]] = {}
-        for sample, stop in enumerate(begin.tolist()):
-            stops.setdefault(stop, []).append(sample)
-        found = self._written(
-            self.init(len(order)),
-            histories,
-            histories.places[samples],
-            until[order],
-            _of(query, samples),
-            stops,
-            row_of,
-        )
-        back = torch.tensor([sample for stop in sorted(stops) for sample in stops[stop]], device=begin.device)
-        return _rows(self.join(found), back.argsort())
+        own = None if query is None else query.rows(latest)
+        return self._written(self.init(len(first)), histories, histories.places[latest], own, begin, episode)
 
     def _written(
-        self,
-        state: State,
-        histories: Histories,
-        places: Tensor,
-        counts: Tensor,
-        query: Query | None,
-        stops: dict[int, list[int]] | None = None,
-        row_of: Tensor | None = None,
-    ) -> list[State]:
-        """Write the first ``counts`` (R,) frames, descending, of the rows' ``places`` (R, T); return states on the way.
+        self, state: State, histories: Histories, places: Tensor, query: Query | None, stops: Tensor, row_of: Tensor
+    ) -> State:
+        """Write the frames of R rows, ``places`` (R, T); return the states of B samples on the way.
 
-        Returns:
-            Without ``stops``: the states of the rows that end after 0, 1, ... frames. With ``stops`` (number of
-            frames -> samples): the states of these samples, whose rows are ``row_of`` (B,).
+        Args:
+            stops: (B,) number of frames after which a sample's state is taken. row_of: (B,) its row.
         """
-        needed, where = places.clamp(min=0).unique(return_inverse=True)
+        counts = torch.zeros_like(places[:, 0]).scatter_reduce(0, row_of, stops, "amax")
+        order = counts.argsort(descending=True, stable=True)  # finished rows are dropped from the end
+        state, row_of, ends = _rows(state, order), order.argsort()[row_of], counts[order].tolist()
+        needed, where = places[order].clamp(min=0).unique(return_inverse=True)
         pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
-        left, found = counts.tolist(), []
-        for time in range(left[0] + 1):
-            still = sum(count > time for count in left)
-            if stops is None and still < len(left):
-                found.append(_rows(state, slice(still, len(left))))
-            if stops is not None and time in stops:
-                assert row_of is not None
-                found.append(_rows(state, row_of[stops[time]]))
-            left, state = left[:still], _rows(state, slice(still))
-            if still:
-                now, part = where[:still, time], _of(query, slice(still))
+        query, states, samples = None if query is None else query.rows(order), [], []
+        for time in range(ends[0] + 1):
+            samples.append((stops == time).nonzero().flatten())
+            if len(samples[-1]):
+                states.append(_rows(state, row_of[samples[-1]]))
+            going = sum(end > time for end in ends)
+            state = _rows(state, slice(going))
+            if going:
+                now, part = where[:going, time], None if query is None else query.rows(slice(going))
                 state = self.write(state, pooled[now], steps[now], part)
-        return found
+        return _rows(self.join(states), torch.cat(samples).argsort())
 
     # -- losses -------------------------------------------------------------------------------------
 
@@ -341,7 +315,7 @@ class MemoryMechanism(nn.Module, ABC):
         that the actions follow its own choice.
 
         Args:
-            batch: the training batch, and `Reading.outputs` of its fusion.
+            batch: the training batch, and `MemoryPass.outputs` of its fusion.
         """
         return {}
 
@@ -356,10 +330,6 @@ def with_noise(values: Tensor, generator: torch.Generator) -> Tensor:
 
 def _rows(state: dict[str, Tensor], chosen: Any) -> dict[str, Tensor]:
     return {name: tensor[chosen] for name, tensor in state.items()}
-
-
-def _of(query: Query | None, chosen: Any) -> Query | None:
-    return None if query is None else query.rows(chosen)
 
 
 def _like(rows: Tensor, other: Tensor) -> Tensor:

@@ -27,11 +27,7 @@ SLOTS_OF_WIDTH = 4
 
 @dataclass
 class RecurrenceSettings:
-    """Settings of a recurrence.
-
-    Attributes:
-        gradient_frames: number of last frames through which gradients pass.
-    """
+    """Settings of a recurrence: the number of last frames through which gradients pass."""
 
     gradient_frames: int = 16
 
@@ -44,11 +40,7 @@ class RecurrenceSettings:
 
 @dataclass
 class RecurrentSettings(RecurrenceSettings):
-    """Settings of `Recurrent`.
-
-    Attributes:
-        slots: number of slots; None: a quarter of the width of memory tokens.
-    """
+    """Settings of `Recurrent`: the number of slots; None: a quarter of the width of memory tokens."""
 
     slots: int | None = None
 
@@ -64,9 +56,8 @@ class Recurrent(MemoryMechanism):
     For a frame X and slots S: Z = LN_pre([X; S]); O is softmax attention of the slots' rows of Z to all of Z, with
     rotary positions along [X; S] and one key-value head; S <- LN_post(O W_o + S). One layer, no feed-forward.
 
-    Unlike in the source, slots are carried over from one remembered frame to the next; the source computes them again
-    from the last 64 frames at each chunk. Gradients pass through the last ``gradient_frames``; in the source, through
-    all 64. A frame has this policy's tokens (2 of objects, 16 of a picture; 64 in the source).
+    Unlike in the source, slots are carried over from one remembered frame to the next.
+    `docs/guides/memory/recurrent.md` lists all differences.
     """
 
     Settings = RecurrentSettings

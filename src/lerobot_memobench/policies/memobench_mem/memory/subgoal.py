@@ -7,19 +7,16 @@ text follow the prefix, attend to all of it, and are all that the action expert 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, Prefix, Reading
-from lerobot_memobench.policies.memobench_mem.memory.frames import Frames
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
+from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
-
-if TYPE_CHECKING:
-    from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 
 SCORES = "memory.scores"
 
@@ -66,12 +63,7 @@ def scored(scores: Tensor, choices: Tensor) -> Tensor:
 
 
 class SubgoalChoice(nn.Module):
-    """Modules that the narrow channel adds to the model.
-
-    Attributes:
-        ask: the last token of the prefix, whose last state is scored. score: maps this state to S scores.
-        texts: tokens of the texts.
-    """
+    """Modules that the narrow channel adds: a last token of the prefix, whose last state is scored, and the texts."""
 
     def __init__(self, texts: tuple[str, ...], width: int) -> None:
         super().__init__()
@@ -80,7 +72,7 @@ class SubgoalChoice(nn.Module):
         self.texts = CheckpointTexts(texts, width)
 
 
-class NarrowReading(Reading):
+class NarrowPass(MemoryPass):
     """A pass with LeRobot's prefix, the memory and ``ask``, followed by the chosen text and a copy of the state.
 
     | attends to            | prefix, memory, ask | text | copy of the state | actions |
@@ -94,20 +86,16 @@ class NarrowReading(Reading):
     the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
     the instruction.
 
-    In training the text is the true one; otherwise a pass over the prefix, which does not depend on later tokens,
-    chooses it.
-
-    Attributes:
-        chosen: (B,) index of the text in the prefix; S: the empty text.
+    In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen`` (B,), S: none).
     """
 
     watches = ("prefix",)
 
-    def __init__(self, model: MemoryPI05, memory: MemoryTokens, watched: bool) -> None:
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool) -> None:
         super().__init__(watched)
         assert memory.query is not None
         self.model, self.memory, self.query = model, memory, memory.query
-        self.choice = cast(SubgoalChoice, model.subgoal)
+        self.choice: SubgoalChoice = model.subgoal
         self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
@@ -128,8 +116,7 @@ class NarrowReading(Reading):
     def attends(self, prefix: Prefix, unread: int, copies: int) -> Tensor:
         """Return which tokens attend to which, (B, N, N) bool: see the table.
 
-        Args:
-            unread: number of leading tokens that actions do not read. copies: 1 if the last is the state's copy.
+        Actions do not read the ``unread`` leading tokens; ``copies`` is 1 if the last token is the state's copy.
         """
         places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
         part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: before the text, 1: text, 2: copy
@@ -139,7 +126,6 @@ class NarrowReading(Reading):
 
     @torch.no_grad()
     def _chosen(self, prefix: Prefix) -> Tensor:
-        """Return the indices (B,) of the texts that a pass over this prefix chooses."""
         self.model.read_prefix(prefix, self)
         return self.outputs[SCORES].argmax(dim=1)
 
@@ -149,43 +135,40 @@ class NarrowReading(Reading):
         score = self.choice.score
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
 
-    def shares(self) -> list[Tensor]:
+    def attention_shares(self) -> list[Tensor]:
         """Return the share of the chosen text's attention on each memory token."""
         assert self.chosen is not None
         _, real = self.choice.texts(self.chosen)
         words, length = real.shape[1], self.memory.mask.shape[1]
-        of_prefix, found = self.attention["prefix"], []
+        of_prefix, shares = self.attention["prefix"], []
         for weights in of_prefix[len(of_prefix) // 2 :]:  # (B, heads, N, N), after the pass that chooses
             unread = weights.shape[2] - words - (self.model.state_token is not None)
             read = weights[:, :, unread : unread + words, unread - 1 - length : unread - 1].mean(dim=1)
-            found.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
-        return found
+            shares.append((read * real.unsqueeze(-1)).sum(dim=1) / real.sum(dim=1, keepdim=True))
+        return shares
 
 
 class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read only this text (`NarrowReading`)."""
+    """Choose a text by prefix and memory; actions read only this text (`NarrowPass`)."""
 
     reports_reads = True
     parts = ("subgoal.",)
 
-    def __init__(self, model: MemoryPI05, memory_dim: int, expert_dim: int) -> None:
-        self.model = model
-        assert model.memory is not None
+    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
+        super().__init__(model, memory_dim, expert_dim)
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> Reading:
+    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
         """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
-        return NarrowReading(self.model, memory, watched)
+        return NarrowPass(self.model, memory, watched)
 
 
-class Subgoal(Frames):
+class Subgoal(FrameSampling):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
     As in the source: cross-entropy of the text with weight 1 next to the actions' loss; the expert is trained on states
-    of the true text; its condition is states and embeddings of the text, and the robot's state. Differences: frames are
-    those of ``memory=frames`` (at most 32, even over the episode, not 120 at 2 Hz); the text is chosen from the task's
-    texts and not generated; its words have their own embeddings; the expert is pi0.5's, which reads states of every
-    layer instead of the last layer's.
+    of the true text; its condition is states and embeddings of the text, and the robot's state.
+    `docs/guides/memory/subgoal.md` lists the differences.
     """
 
     privileged = True

@@ -1,0 +1,372 @@
+"""Stage episodes: keep finished ones on disk while a dataset is being made.
+
+Each episode is one folder, complete or absent: it is written under a temporary name and renamed when every file has
+reached the disk, so a run killed at any moment leaves finished episodes, and folders that are recognised as unfinished.
+An episode's file names and bytes depend on the episode alone, never on the worker that made it.
+
+::
+
+    <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
+                              arrays.npz          states, actions, proprio, label columns (no pickle)
+                              image.mp4, wrist_image.mp4
+
+Images are encoded frame by frame while the episode is being made, so a worker's memory does not grow with its length.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
+from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, is_dataset
+from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
+from lerobot_memobench.jobs.processes import HeldError, locked
+from lerobot_memobench.protocol import CAMERAS
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
+
+TEMPORARY = ".tmp-"
+REQUEST_FILE = "request.json"
+EPISODE_FILE = "episode.json"
+ARRAYS_FILE = "arrays.npz"
+FINISHED_EARLY = "finished_early"
+"""Key of a dataset's request: whether episodes of it were left out."""
+ADVICE = "it is damaged; delete its folder and run the command again"
+
+
+# --- a finished episode ---
+
+
+class EpisodeFile(BaseModel):
+    """``episode.json``.
+
+    Attributes:
+        failure: why there is no demonstration of this seed, or None.
+        info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
+            episode at least its task's name and seed.
+        language_persistent: LeRobot's persistent language rows (`persistent_rows`).
+        image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
+        files: name to sha256 of the other files.
+    """
+
+    failure: str | None
+    info: dict[str, Any]
+    language_persistent: list[LanguageRow]
+    image_stats: dict[str, dict[str, Any]]
+    files: dict[str, str]
+
+
+@dataclass(frozen=True)
+class StagedEpisode:
+    """A finished episode's folder and its `EpisodeFile`; arrays and videos are read on demand."""
+
+    folder: Path
+    content: EpisodeFile
+
+    @property
+    def failure(self) -> str | None:
+        """See `EpisodeFile`."""
+        return self.content.failure
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Identity and frames, also of a failed episode."""
+        return self.content.info
+
+    @property
+    def length(self) -> int:
+        """Number of frames."""
+        return int(self.info["frames"])
+
+    def record(self, versions: dict[str, str] | None = None) -> DemonstrationRecord:
+        """Return the record of a successful episode."""
+        return DemonstrationRecord.model_validate(self.info | {"versions": versions})
+
+    def video(self, camera: str) -> Path:
+        """Return the file of a camera's video."""
+        return self.folder / f"{camera}.mp4"
+
+    def image_stats(self, camera: str) -> Stats:
+        """Return the statistics of a camera's pixels (`ImageHistograms`)."""
+        return {name: np.array(value) for name, value in self.content.image_stats[camera].items()}
+
+    def arrays(self) -> dict[str, NDArray]:
+        """Read states, actions, proprio and label columns; text columns are arrays of str."""
+        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+            return dict(data)
+
+    def check(self) -> None:
+        """Raise a MemobenchError that names the first file whose hash differs from the recorded one."""
+        for name, expected in self.content.files.items():
+            path = self.folder / name
+            digest = file_hash(path) if path.is_file() else "missing"
+            if digest != expected:
+                raise MemobenchError(
+                    f"{path} is damaged (sha256 {digest[:12]}, written as {expected[:12]}); delete the folder "
+                    f"{self.folder} and repeat the command to make this episode again"
+                )
+
+
+def read_staged(folder: Path) -> StagedEpisode | None:
+    """Return the finished episode in ``folder``, or None if there is none."""
+    try:
+        return StagedEpisode(folder, read_json(folder / EPISODE_FILE, EpisodeFile, ADVICE))
+    except FileNotFoundError:
+        return None
+
+
+class StagedJob:
+    """A job that makes one episode in ``folder``; two workers may run the same job."""
+
+    folder: Path
+
+    def finished(self) -> bool:
+        """Return whether ``folder`` holds the episode, or the reason of its failure."""
+        return read_staged(self.folder) is not None
+
+    def episode(self) -> StagedEpisode:
+        """Return the episode of a finished job."""
+        episode = read_staged(self.folder)
+        if episode is None:
+            raise MemobenchError(f"{self.folder} was removed during the run; run the command again")
+        return episode
+
+    def failure(self) -> str | None:
+        """Return why a finished job has no episode, or None."""
+        return self.episode().failure
+
+
+# --- writing an episode ---
+
+
+class EpisodeStage:
+    """Write one episode to ``folder``, images frame by frame, everything else at the end; an equal one is kept.
+
+    A context: an episode that was not published when it ends is removed. ``convention`` is that of the videos.
+    """
+
+    def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
+        self._folder, self._convention = folder, convention
+        self._temporary = _temporary_folder(folder)
+        names = CONVENTIONS[convention].values()
+        self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
+        self._histograms = {name: ImageHistograms() for name in names}
+        self._frames = 0
+
+    def __enter__(self) -> EpisodeStage:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for video in self._videos.values():
+            with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all files are deleted
+                video.abandon()
+        shutil.rmtree(self._temporary, ignore_errors=True)
+
+    def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Add the next frame of both cameras, (H, W, 3) uint8 each, upright."""
+        self._frames += 1
+        for name, image in shown(images, self._convention).items():
+            self._videos[name].add(image)
+            self._histograms[name].add(image)
+
+    def publish(self, demo: Demonstration) -> StagedEpisode:
+        """Write everything except the images, which were added before, and give the folder its name."""
+        if self._frames not in (0, len(demo)):
+            raise MemobenchError(
+                f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
+                "were recorded; add one per frame and camera, or none"
+            )
+        columns = labels(demo)
+        record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
+        info = record | {"language": demo.task.language, "frames": len(demo)}
+        _check_storable(info, columns)
+        for video in self._videos.values():
+            video.close()
+        stats = {
+            camera: {name: value.tolist() for name, value in histograms.stats().items()}
+            for camera, histograms in (self._histograms if self._frames else {}).items()
+        }
+        arrays: dict[str, Any] = {
+            "states": demo.states,
+            "actions": demo.actions,
+            "proprio": demo.proprio,
+            "objects": demo.objects,
+            **({} if demo.executed is None else {"executed": demo.executed}),
+            **columns,
+        }
+        np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
+        return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)
+
+
+def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
+    """Raise unless a dataset's tables can hold the episode; otherwise the assembly of all episodes would fail."""
+    texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
+    try:
+        json.dumps([info, texts], ensure_ascii=False).encode()
+        np.array([info["seed"], info["variant"]], dtype=np.int64)
+    except (UnicodeEncodeError, OverflowError) as error:
+        raise MemobenchError(
+            f"{info['task_name']!r}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
+            f"({error}); correct the task's texts or the seed"
+        ) from None
+
+
+def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
+    """Write a demonstration in memory, with its images, to ``folder``; an equal one that exists already is kept."""
+    with EpisodeStage(folder, convention) as stage:
+        for frame in range(len(demo) if demo.images is not None else 0):
+            assert demo.images is not None
+            stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
+        return stage.publish(demo)
+
+
+def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
+    """Store the reason why a seed has no demonstration, so that a resumed run reports it as well."""
+    temporary = _temporary_folder(folder)
+    try:
+        return _publish(temporary, folder, reason, info, [], {})
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _publish(
+    temporary: Path,
+    folder: Path,
+    failure: str | None,
+    info: dict[str, Any],
+    language_rows: list[LanguageRow],
+    image_stats: dict[str, Any],
+) -> StagedEpisode:
+    """Add the record, flush everything to the disk, then give the folder its name."""
+    files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
+    content = EpisodeFile(
+        failure=failure, info=info, language_persistent=language_rows, image_stats=image_stats, files=files
+    )
+    (temporary / EPISODE_FILE).write_text(content.model_dump_json())
+    flush_to_disk([*temporary.iterdir(), temporary])
+    try:
+        temporary.rename(folder)
+    except OSError:
+        staged = read_staged(folder)  # another worker was first
+        if staged is None or staged.info != info:
+            raise MemobenchError(f"{folder} holds another episode; delete it and run again") from None
+        return staged
+    flush_to_disk([folder.parent])
+    return StagedEpisode(folder, content)
+
+
+def _temporary_folder(folder: Path) -> Path:
+    """Make and return an empty folder, to be renamed to ``folder`` when it is complete.
+
+    Killed workers leave such folders, which are removed with the staging folder.
+    """
+    temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
+    temporary.mkdir(parents=True)
+    return temporary
+
+
+def flush_to_disk(paths: Iterable[Path]) -> None:
+    """Wait until the disk holds files, or the entries of folders."""
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+# --- the run ---
+
+
+def check_destination(out: Path) -> None:
+    """Raise unless ``out`` is absent, empty, or holds only an unfinished run."""
+    if is_dataset(out):
+        raise MemobenchError(f"{out} already holds a finished dataset; name another folder or delete this one first")
+    if ":" in str(out) and not out.is_absolute():
+        raise MemobenchError(f"{out} contains a colon, which Arrow reads as an address; use an absolute path")
+    if out.exists() and not out.is_dir():
+        raise MemobenchError(f"{out} is a file, expected a folder to write a dataset to; name another path")
+    refuse_links(*(out / name for name in (STAGING, *TOP_LEVEL)))
+    # Files of an interrupted move next to the staging folder are replaced.
+    strangers = [p.name for p in out.iterdir() if p.name != STAGING] if out.is_dir() else []
+    if strangers and not ((out / STAGING).is_dir() and set(strangers) <= set(TOP_LEVEL)):
+        raise MemobenchError(
+            f"{out} holds {', '.join(sorted(strangers)[:3])}, no part of a dataset being made; name an empty folder"
+        )
+
+
+@contextlib.contextmanager
+def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
+    """Lock the destination ``out`` for a run with ``request``; yield the folder of its finished episodes.
+
+    Episodes of an unfinished run of the same request are kept.
+
+    Raises:
+        MemobenchError: another run is writing there, or an unfinished run has another request.
+    """
+    staging = out / STAGING
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        remove_drafts(staging)
+        path = staging / REQUEST_FILE
+        try:
+            earlier = read_json(path, dict[str, Any], "delete its folder to start again")
+        except FileNotFoundError:
+            write_file(path, json.dumps(request, indent=1), durable=True)
+        else:
+            advice = f"delete {staging} to start again or name another folder"
+            _compare_requests(earlier, request, f"{out} holds an unfinished run", advice)
+        folder = staging / "episodes"
+        folder.mkdir(exist_ok=True)
+        yield folder.absolute()
+
+
+def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dict[str, Any] | None:
+    """Return the manifest of a finished dataset with this request, None if ``out`` holds no dataset.
+
+    A staging folder that a kill in the last moment left is removed.
+
+    Raises:
+        MemobenchError: the dataset is damaged, has another request, or another command made it, whose manifest lacks
+            a ``required`` key.
+    """
+    if not is_dataset(out):
+        return None
+    try:
+        manifest = read_manifest(out)
+    except FileNotFoundError:
+        manifest = {}
+    if not {"request", *required} <= set(manifest):
+        raise MemobenchError(f"{out} already holds a dataset that this command did not make; name another folder")
+    # A finished dataset stays valid under newer versions.
+    earlier = manifest["request"] | {key: value for key, value in request.items() if key == "versions"}
+    _compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
+    check_whole(out)
+    staging = out / STAGING
+    with contextlib.suppress(FileNotFoundError, HeldError), locked(staging, out):
+        shutil.rmtree(staging, ignore_errors=True)
+    return manifest
+
+
+def _compare_requests(earlier: dict[str, Any], request: dict[str, Any], subject: str, advice: str) -> None:
+    for key, value in {FINISHED_EARLY: False, **request}.items():  # only `generate --finish` writes this key
+        before = {FINISHED_EARLY: False, **earlier}.get(key)
+        if before != value:
+            raise MemobenchError(f"{subject} with {key}={short(before)}, now {short(value)} was asked for; {advice}")

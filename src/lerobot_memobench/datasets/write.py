@@ -1,0 +1,417 @@
+"""Assemble a LeRobotDataset v3.0 from finished episodes.
+
+It is built in the hidden folder ``.staging`` of its destination and moved up, ``meta`` last: without
+``meta/info.json`` a folder is not a dataset.
+
+:func:`assemble` takes episodes that workers have staged, already encoded; :func:`write_dataset` stages demonstrations
+that are in memory first. LeRobot's own metadata writer and feature schema are used; its frame-by-frame recording loop
+is not, because it writes every image as PNG first, copies a growing video again for every episode, and drops language
+rows, which a second pass has to add.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_memobench.datasets.card import write_card
+from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
+from lerobot_memobench.datasets.episodes import ListedEpisode
+from lerobot_memobench.datasets.layout import (
+    DEFAULT_REPO_ID,
+    EPISODE_INFO,
+    EXECUTED_ACTION,
+    LANGUAGE,
+    MANIFEST_FILE,
+    STAGING,
+    TOP_LEVEL,
+    dataset_features,
+    dataset_files,
+    image_key,
+    objects_column,
+)
+from lerobot_memobench.datasets.stage import (
+    TEMPORARY,
+    StagedEpisode,
+    check_destination,
+    flush_to_disk,
+    stage_demonstration,
+)
+from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import file_hash, files_below, write_file
+from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
+from lerobot_memobench.sim.convention import UPRIGHT
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+ROBOT_TYPE = "panda"
+STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PER_STATES_FILE = 100
+BLOCK = 16
+"""Columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes."""
+
+
+def write_dataset(
+    demonstrations: Iterable[Demonstration],
+    out: Path | str,
+    *,
+    repo_id: str = DEFAULT_REPO_ID,
+    made_by: str = "",
+    convention: str = UPRIGHT,
+) -> Path:
+    """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
+
+    Either all of them have images or none. ``made_by`` is a sentence for the card, ``convention`` that of the images.
+    """
+    out = Path(out)
+    check_destination(out)
+    staging = out / STAGING
+    episodes = staging / "episodes"
+    staging.mkdir(parents=True, exist_ok=True)
+    with locked(staging, out):
+        try:
+            shutil.rmtree(episodes, ignore_errors=True)
+            staged = [
+                stage_demonstration(demo, episodes / f"{k:06d}", convention) for k, demo in enumerate(demonstrations)
+            ]
+            return assemble(staged, out, repo_id=repo_id, made_by=made_by)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+            if out.is_dir() and not any(out.iterdir()):
+                out.rmdir()
+
+
+def assemble(
+    episodes: Sequence[StagedEpisode],
+    out: Path | str,
+    *,
+    repo_id: str = DEFAULT_REPO_ID,
+    made_by: str = "",
+    manifest: dict[str, Any] | None = None,
+    left_out: Sequence[str] = (),
+) -> Path:
+    """Build the dataset of the staged ``episodes`` in ``out``; failed ones are listed, but not written.
+
+    Deterministic: equal episodes give equal files.
+
+    Args:
+        made_by: sentence for the card.
+        manifest: further content of manifest.json.
+        left_out: reasons for the card why further episodes are missing.
+    """
+    out = Path(out)
+    written = [episode for episode in episodes if episode.failure is None]
+    if not written:
+        raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
+    if len({tuple(episode.content.image_stats) for episode in written}) > 1:
+        raise MemobenchError(
+            f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
+        )
+    for episode in written:
+        episode.check()
+
+    build = out / STAGING / f"{TEMPORARY}dataset"
+    shutil.rmtree(build, ignore_errors=True)
+    versions = (manifest or {}).get("request", {}).get("versions")
+    features, listed = _write_lerobot(written, build, repo_id, versions)  # makes the folder
+    _write_manifest(episodes, listed, manifest or {}, build)
+    failed = [episode for episode in episodes if episode.failure is not None]
+    write_card(build, listed, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    _move(build, out)
+    return out
+
+
+def _write_lerobot(
+    written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
+) -> tuple[dict[str, dict[str, Any]], list[ListedEpisode]]:
+    """Write the LeRobotDataset of the episodes into ``build``; return its features and its list of episodes."""
+    from lerobot.datasets.compute_stats import aggregate_stats
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.datasets.io_utils import write_stats
+
+    cameras = written[0].content.image_stats
+    meta = LeRobotDatasetMetadata.create(
+        repo_id=repo_id,
+        fps=CONTROL_HZ,
+        features=dataset_features(_image_size(written[0]), cameras),
+        root=build,
+        robot_type=ROBOT_TYPE,
+        use_videos=bool(cameras),
+        metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
+    )
+    numbers, listed = _write_frames(meta, written, versions)
+    of_images = aggregate_stats([_camera_statistics(episode) for episode in written]) if cameras else {}
+    # LeRobot's come in the order of a set, another one in each process.
+    meta.stats = numbers | {key: of_images[key] for key in map(image_key, cameras)}
+    write_stats(meta.stats, meta.root)
+    meta.finalize()
+    return dict(meta.features), listed
+
+
+def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
+    import av
+
+    for camera in episode.content.image_stats:
+        with av.open(str(episode.video(camera))) as container:
+            stream = container.streams.video[0]
+            return stream.height, stream.width
+    return None
+
+
+def _write_manifest(
+    episodes: Sequence[StagedEpisode], listed: Sequence[ListedEpisode], extra: dict[str, Any], build: Path
+) -> None:
+    """Write the hashes of all files and requested episodes; failed ones have a reason instead of an index."""
+    keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
+    rows, indices = [], iter(listed)
+    for episode in episodes:
+        row = {key: episode.info.get(key) for key in keys}
+        row |= {key: episode.info[key] for key in ("world", "stand_ins") if key in episode.info}
+        index = next(indices).index if episode.failure is None else None
+        rows.append(row | {"episode_index": index, "failure": episode.failure})
+    files = {
+        name: {"bytes": (build / name).stat().st_size, "sha256": file_hash(build / name)}
+        for name in dataset_files(build)
+    }
+    write_file(build / MANIFEST_FILE, json.dumps(extra | {"episodes": rows, "files": files}, indent=1), durable=True)
+
+
+def _move(build: Path, out: Path) -> None:
+    """Move the finished build into ``out``, which becomes a dataset with the last move."""
+    out.mkdir(parents=True, exist_ok=True)
+    flush_to_disk(files_below(build))
+    for name in TOP_LEVEL:
+        target = out / name
+        if target.is_dir():
+            shutil.rmtree(target)  # of an interrupted move: `meta` is not there yet
+        if (build / name).exists():
+            os.replace(build / name, target)
+    flush_to_disk([out])
+    build.rmdir()
+
+
+# --- frames, states and metadata ---
+
+
+def _write_frames(
+    meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: dict[str, str] | None
+) -> tuple[dict[str, Stats], list[ListedEpisode]]:
+    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers, and the episodes' places.
+
+    Each episode is one row group, in files of LeRobot's size.
+    """
+    data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
+    numbers: dict[str, list[NDArray]] = {}
+    listed: list[ListedEpisode] = []
+    start = 0
+    for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
+        if data.size() >= meta.data_files_size_in_mb * 1024**2:
+            data.next(meta.chunks_size)
+        if number and number % EPISODES_PER_STATES_FILE == 0:
+            states.next(meta.chunks_size)
+        task, length = str(episode.info["language"]), episode.length
+        meta.save_episode_tasks([task])
+        arrays, record = episode.arrays(), episode.record(versions)
+        numbering = {
+            "timestamp": (np.arange(length) / CONTROL_HZ).astype(np.float32),
+            "frame_index": np.arange(length),
+            "episode_index": np.full(length, number),
+            "index": start + np.arange(length),
+            "task_index": np.full(length, meta.get_task_index(task)),
+        }
+        info = np.full(length, "", dtype=object)
+        info[0] = record.in_frames()
+        columns = {
+            "observation.state": arrays["proprio"],
+            "action": arrays["actions"],
+            EXECUTED_ACTION: arrays.get("executed", arrays["actions"]),
+            **numbering,
+            EPISODE_INFO: info,
+            objects_column(meta.features): arrays["objects"],
+            **{key: arrays[key] for key in meta.features if key in arrays},
+        }
+        data.write(_frames_table(columns, episode, meta.features))
+        states.write(_states_table(arrays["states"], number))
+        # LeRobot does not normalise columns without statistics: phase and step reach a policy as in a rollout.
+        numeric = {key: value for key, value in columns.items() if value.dtype.kind in "bif" and key not in CLOCK}
+        # Held frames do not count: nothing is learned from them, and they may be most frames.
+        counted = {key: value[~arrays[HELD_COLUMN]] for key, value in numeric.items()}
+        for key, value in counted.items():
+            numbers.setdefault(key, []).append(value)
+        stats = {key: numeric_stats(value) for key, value in counted.items()} | _camera_statistics(episode)
+        files = {
+            "data/chunk_index": data.chunk,
+            "data/file_index": data.file,
+            "dataset_from_index": start,
+            "dataset_to_index": start + length,
+        }
+        meta.save_episode(number, length, [task], stats, files | videos | record.in_meta())
+        listed.append(ListedEpisode(number, start, length, record))
+        start += length
+    data.close()
+    states.close()
+    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}, listed
+
+
+def numeric_stats(values: NDArray) -> Stats:
+    """Return exact statistics of (T,) or (T, n) numbers over T: each (n,) (n = 1 for (T,)), and ``count`` (1,).
+
+    LeRobot averages the quantiles of episodes, which is not a quantile of the dataset. pi0.5 normalises by q01 and q99,
+    so they are computed from all frames.
+    """
+    flat = values.reshape(len(values), -1)
+    blocks = [_stats_of(flat[:, start : start + BLOCK].astype(np.float64)) for start in range(0, flat.shape[1], BLOCK)]
+    stats = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    return stats | {"count": np.array([len(values)])}
+
+
+def _stats_of(flat: NDArray[np.float64]) -> Stats:
+    stats = {"min": flat.min(0), "max": flat.max(0), "mean": flat.mean(0), "std": flat.std(0)}
+    quantiles = np.quantile(flat, QUANTILES, axis=0, overwrite_input=True)
+    return stats | {f"q{int(q * 100):02d}": row for q, row in zip(QUANTILES, quantiles, strict=True)}
+
+
+def _camera_statistics(episode: StagedEpisode) -> dict[str, Stats]:
+    return {image_key(camera): episode.image_stats(camera) for camera in episode.content.image_stats}
+
+
+# --- tables and their files ---
+
+
+def _frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
+    """Return an episode's columns and language rows as a table of the type that LeRobot reads."""
+    import pyarrow as pa
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    typed = get_hf_features_from_features(features)
+    arrays = [
+        _language(episode, typed[LANGUAGE]) if field.name == LANGUAGE else _array(columns[field.name], field.type)
+        for field in typed.arrow_schema
+    ]
+    return pa.Table.from_arrays(arrays, schema=typed.arrow_schema)
+
+
+def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
+    import pyarrow as pa
+
+    if values.ndim == 2:
+        return pa.FixedSizeListArray.from_arrays(pa.array(values.ravel(), type=kind.value_type), type=kind)
+    return pa.array(values.tolist() if values.dtype.kind in "UO" else values, type=kind)
+
+
+def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
+    """Return the episode's rows, equal at every frame: built once and repeated by index."""
+    import datasets
+
+    once = datasets.Dataset.from_dict(
+        {LANGUAGE: [episode.content.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
+    ).with_format("arrow")[:]
+    return once.column(LANGUAGE).combine_chunks().take(np.zeros(episode.length, dtype=np.int64))
+
+
+def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
+    import pyarrow as pa
+
+    length, width = states.shape
+    offsets = pa.array(np.arange(0, (length + 1) * width, width, dtype=np.int32))
+    return pa.table(
+        {
+            "episode_index": pa.array(np.full(length, number)),
+            "frame_index": pa.array(np.arange(length)),
+            "state": pa.ListArray.from_arrays(offsets, pa.array(states.ravel())),
+        }
+    )
+
+
+class ParquetFiles:
+    """Parquet files in LeRobot's chunk and file numbering; each write is a row group."""
+
+    def __init__(self, build: Path, template: str) -> None:
+        self.build, self.template = build, template
+        self.chunk, self.file = 0, 0
+        self._writer: Any = None
+        self._path: Path | None = None
+
+    def write(self, table: pa.Table) -> None:
+        """Append a row group to the current file."""
+        import pyarrow.parquet as pq
+
+        if self._writer is None:
+            self._path = self.build / self.template.format(chunk_index=self.chunk, file_index=self.file)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy", use_dictionary=True)
+        self._writer.write_table(table)
+
+    def size(self) -> int:
+        """Return the bytes of the current file."""
+        return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
+
+    def next(self, chunks_size: int) -> None:
+        """Begin the next file."""
+        from lerobot.datasets.utils import update_chunk_file_indices
+
+        self.close()
+        self.chunk, self.file = update_chunk_file_indices(self.chunk, self.file, chunks_size)
+
+    def close(self) -> None:
+        """End the current file."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+
+# --- videos ---
+
+
+def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
+    """Join the episodes' videos below the dataset's root; return each episode's columns of meta/episodes."""
+    from lerobot.datasets.io_utils import write_info
+    from lerobot.datasets.utils import update_chunk_file_indices
+
+    columns: list[dict[str, Any]] = [{} for _ in episodes]
+    limit = meta.video_files_size_in_mb * 1024**2
+    for camera in episodes[0].content.image_stats:
+        key, chunk, file = image_key(camera), 0, 0
+        videos = [(episode.video(camera), episode.length) for episode in episodes]
+        for group in _grouped([video.stat().st_size for video, _ in videos], limit):
+            assert meta.video_path is not None
+            path = meta.root / meta.video_path.format(video_key=key, chunk_index=chunk, file_index=file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            join_videos([videos[i] for i in group], path)
+            frames = 0
+            for i in group:
+                start, frames = frames, frames + videos[i][1]
+                columns[i] |= {
+                    f"videos/{key}/chunk_index": chunk,
+                    f"videos/{key}/file_index": file,
+                    f"videos/{key}/from_timestamp": start / CONTROL_HZ,
+                    f"videos/{key}/to_timestamp": frames / CONTROL_HZ,
+                }
+            chunk, file = update_chunk_file_indices(chunk, file, meta.chunks_size)
+            meta.features[key].setdefault("info", video_info(path))
+        write_info(meta.info, meta.root)
+    return columns
+
+
+def _grouped(sizes: Sequence[int], limit: float) -> list[list[int]]:
+    """Group consecutive positions whose sizes sum up to at most ``limit``; a larger one forms its own group."""
+    groups: list[list[int]] = []
+    total = 0
+    for position, size in enumerate(sizes):
+        if not groups or total + size > limit:
+            groups.append([])
+            total = 0
+        groups[-1].append(position)
+        total += size
+    return groups

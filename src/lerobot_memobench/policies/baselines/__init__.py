@@ -1,1 +1,0 @@
-"""Baselines without weights: the scripted expert, the published routine replayed blindly, and random actions."""

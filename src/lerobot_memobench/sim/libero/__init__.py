@@ -1,1 +1,0 @@
-"""Scenes of LIBERO's assets: models, placements and pictures, built without LIBERO's simulator."""
