@@ -84,8 +84,8 @@ def test_report_of_the_hand_made_log() -> None:
 def test_ordered_prefix_counts_only_what_came_in_order() -> None:
     late = rollout("t1", "temporal", "SU", [9, 3], True, ordered=[9, None])
     summary = summary_of([late])
-    assert [rate.value for rate in summary.prefix["t1"]] == [1.0, 1.0]
-    assert [rate.value for rate in summary.ordered_prefix["t1"]] == [1.0, 0.0]
+    assert [rate.value for rate in summary.tasks["t1"].prefix] == [1.0, 1.0]
+    assert [rate.value for rate in summary.tasks["t1"].ordered_prefix] == [1.0, 0.0]
 
 
 def test_pooled_rate_is_over_all_checkpoint_records() -> None:
@@ -105,7 +105,7 @@ def test_versions_of_a_task_are_not_mixed() -> None:
         by_task([rollout("t", "musical", "S", [1], True)])
 
 
-WHOSE = {"policy": "act 1", "run": "1", "inputs": "pixels"}
+WHOSE = {"referent": "fixed", "inputs": "pixels"}
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,6 @@ WHOSE = {"policy": "act 1", "run": "1", "inputs": "pixels"}
         ({"replan_steps": 20}, "replan intervals (20, 5)"),
         ({"seed": 5002}, "seeds of episode 0 (7, 4999)"),
         ({"inputs": "poses"}, "policy inputs (pixels, poses)"),
-        ({"run": None}, "1 rollout of 4 names no policy"),
     ],
 )
 def test_mixed_protocols_are_noted(changes: dict[str, Any], named: str) -> None:

@@ -321,13 +321,13 @@ def evaluation_on_page(
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {
             name: {
-                "rates": row_data(row),
-                "operations": summary.operations_of[name],
-                "prefix": [rate_data(rate) for rate in summary.prefix[name]],
-                "ordered_prefix": [rate_data(rate) for rate in summary.ordered_prefix[name]],
+                "rates": row_data(task.rates),
+                "operations": task.operations,
+                "prefix": [rate_data(rate) for rate in task.prefix],
+                "ordered_prefix": [rate_data(rate) for rate in task.ordered_prefix],
                 "outcomes": outcomes(summary, [name]),
             }
-            for name, row in summary.tasks.items()
+            for name, task in summary.tasks.items()
         },
         "episodes": [episode_data(record, videos.get(k), reads.get(k, ())) for k, record in enumerate(run.records)],
     }

@@ -380,36 +380,43 @@ SUITE: Final = "suite"
 
 
 @dataclass(frozen=True)
+class TaskSummary:
+    """All rates of one task's rollouts.
+
+    Attributes:
+        operations: labels of the checkpoints, such as "SUU".
+        prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any order.
+        ordered_prefix: the same in order.
+        failures: class -> number of failed rollouts.
+    """
+
+    memory_type: str
+    operations: str
+    rates: Row
+    prefix: list[Rate]
+    ordered_prefix: list[Rate]
+    failures: dict[str, int]
+
+
+@dataclass(frozen=True)
 class Summary:
     """All rates of a set of rollouts.
 
     Attributes:
-        tasks: name -> metrics.
         memory_types: name -> metrics, each the mean over its applicable tasks; a suite of LIBERO is one of them.
         average: mean over the applicable memory types.
         pooled: MSR, MUR, MCR over all checkpoint records of the operation, of all tasks; n counts records.
         pooled_checkpoints: the same over all checkpoint records, of all operations.
-        prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any
-            order.
-        ordered_prefix: the same in order.
         failures: class -> number of failed rollouts.
-        failures_of: the same by task.
-        memory_type_of: task -> memory type.
-        operations_of: task -> its checkpoints' labels, such as "SUU".
         inputs: of the policy, in words.
     """
 
-    tasks: dict[str, Row]
+    tasks: dict[str, TaskSummary]
     memory_types: dict[str, Row]
     average: Row
     pooled: Row
     pooled_checkpoints: Rate
-    prefix: dict[str, list[Rate]]
-    ordered_prefix: dict[str, list[Rate]]
     failures: dict[str, int]
-    failures_of: dict[str, dict[str, int]]
-    memory_type_of: dict[str, str]
-    operations_of: dict[str, str]
     inputs: str
 
     @property
@@ -428,19 +435,31 @@ class Summary:
         """How many rollouts there are."""
         return self.pooled["SR"].n
 
+    def tasks_of(self, memory_type: str) -> list[str]:
+        """Return the names of a memory type's tasks, or of a suite's."""
+        return [name for name, task in self.tasks.items() if task.memory_type == memory_type]
+
 
 def summary_of(records: Iterable[Record]) -> Summary:
     """Compute all rates of a set of rollouts."""
     records = list(records)
     if not records:
         raise MemobenchError("there are no rollouts to report; run an evaluation first")
-    groups = by_task(records)
-    tasks = {name: task_row(group) for name, group in groups.items()}
-    memory_type_of = {name: str(group[0]["memory_type"]) for name, group in groups.items()}
-    memory_types: dict[str, Row] = {
-        memory_type: mean_row(tasks[name] for name in tasks if memory_type_of[name] == memory_type)
+    tasks = {
+        name: TaskSummary(
+            str(group[0]["memory_type"]),
+            operations(group[0]),
+            task_row(group),
+            _prefix_rates(group, satisfied),
+            _prefix_rates(group, completed_in_order),
+            failure_counts(group),
+        )
+        for name, group in by_task(records).items()
+    }
+    memory_types = {
+        memory_type: mean_row(rows)
         for memory_type in GROUPS
-        if memory_type in memory_type_of.values()
+        if (rows := [task.rates for task in tasks.values() if task.memory_type == memory_type])
     }
     return Summary(
         tasks=tasks,
@@ -448,12 +467,7 @@ def summary_of(records: Iterable[Record]) -> Summary:
         average=mean_row(memory_types.values()),
         pooled=pooled_row(records),
         pooled_checkpoints=share([done for record in records for done in satisfied(record)]),
-        prefix={name: _prefix_rates(group, satisfied) for name, group in groups.items()},
-        ordered_prefix={name: _prefix_rates(group, completed_in_order) for name, group in groups.items()},
         failures=failure_counts(records),
-        failures_of={name: failure_counts(group) for name, group in groups.items()},
-        memory_type_of=memory_type_of,
-        operations_of={name: operations(group[0]) for name, group in groups.items()},
         inputs=inputs_phrase(records),
     )
 
@@ -461,11 +475,11 @@ def summary_of(records: Iterable[Record]) -> Summary:
 def report_values(summary: Summary) -> dict[str, Any]:
     """Return the content of ``report.json``: percentages with one decimal, null where not applicable."""
     return {
-        "tasks": {name: _percentages(row) for name, row in summary.tasks.items()},
+        "tasks": {name: _percentages(task.rates) for name, task in summary.tasks.items()},
         "memory_types": {name: _percentages(row) for name, row in summary.memory_types.items()},
         "average": _percentages(summary.average),
         "failures": dict(summary.failures),
-        "prefix": {name: [percent(rate.value) for rate in rates] for name, rates in summary.prefix.items()},
+        "prefix": {name: [percent(rate.value) for rate in task.prefix] for name, task in summary.tasks.items()},
         "inputs": summary.inputs,
     }
 
