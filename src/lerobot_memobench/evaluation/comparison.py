@@ -84,7 +84,7 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
             )
     unlike = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
     names = [each.split(":")[0] for each in unlike]
-    pairs = _common_episodes(a, b, {*allow, *names})
+    pairs = _common_episodes(a, b)
     unlike_episodes = _unlike_episodes(pairs, {*allow, *names})
     if unlike or unlike_episodes:
         names += unlike_episodes
@@ -98,13 +98,12 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
     return pairs
 
 
-def _common_episodes(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
-    """Return the rollouts of the same task, number and referent; under different salts, of the same variant too."""
+def _common_episodes(a: Run, b: Run) -> list[Pair]:
+    """Return the rollouts of the same task and number; under different salts, of the same variant too."""
     redrawn = other_draws(a, b)
 
-    def key(record: Record) -> tuple[str, int, str, int | None]:
-        referent = "" if "referent" in allow else str(record.get("referent", "fixed"))
-        return record["task"], record["episode"], referent, record.get("variant") if redrawn else None
+    def key(record: Record) -> tuple[str, int, int | None]:
+        return record["task"], record["episode"], record.get("variant") if redrawn else None
 
     others = {key(record): record for record in b.records}
     pairs = [(record, others[key(record)]) for record in a.records if key(record) in others]

@@ -15,7 +15,6 @@ import os
 import re
 import shlex
 import shutil
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -183,10 +182,6 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
                     videos[k] = video
                 else:
                     misfits.append(video.name)
-    # A video's name does not hold the referent: where both settings are in one log, it could be of either.
-    claims = Counter(videos.values())
-    misfits += [video.name for video, count in claims.items() if count > 1]
-    videos = {k: video for k, video in videos.items() if claims[video] == 1}
     if not misfits:
         return videos, []
     listed = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")

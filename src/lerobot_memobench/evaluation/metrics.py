@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from lerobot_memobench.envs.episode_log import seed_base
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
@@ -85,25 +84,13 @@ NOT_RECORDED = "not recorded"
 
 
 def inputs_phrase(records: Iterable[Record]) -> str:
-    """Return the inputs that rollouts record, and how many rollouts record none where others do."""
-    known = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
-    unknown = known.pop(NOT_RECORDED, 0)
-    rest = [f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if known and unknown else []
-    return "; ".join([*sorted(known), *rest]) or NOT_RECORDED
+    """Return the inputs that rollouts record; they differ only between evaluations."""
+    return "; ".join(sorted({str(record.get("inputs") or NOT_RECORDED) for record in records})) or NOT_RECORDED
 
 
 def varies(record: Record) -> bool:
     """Return whether the scene of a rollout is run with several variants."""
     return (record.get("variants") or 1) > 1
-
-
-PROTOCOL: dict[str, Callable[[Record], Any]] = {
-    "referent settings": lambda record: str(record.get("referent")),
-    "replan intervals": lambda record: str(record.get("replan_steps")),
-    "policy inputs": lambda record: record.get("inputs"),
-    "seeds of episode 0": lambda record: None if record.get("seed") is None else seed_base(record),
-}
-"""Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
 
 
 def notes_on(records: Sequence[Record]) -> list[str]:
@@ -114,7 +101,7 @@ def notes_on(records: Sequence[Record]) -> list[str]:
             f"{task}: the demonstration prompt did not show its scene in {count_of(len(group), 'rollout')}, the first "
             f"in episode {group[0]['episode']}; no memory of it can solve the task"
         )
-    notes += unsettled(records) + mixtures(records)
+    notes += unsettled(records)
     if missing := stand_ins_of(records):
         notes.append(
             f"this package's objects replaced the missing scans {', '.join(missing)}: figures with and without them do "
@@ -149,18 +136,6 @@ def unsettled(records: Iterable[Record]) -> list[str]:
     place = "results/unsettled_scenes.md lists those of the paper's seeds"
     note = f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"
     return [note] if counts else []
-
-
-def mixtures(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each part of the protocol in which rollouts differ."""
-    records = list(records)
-    notes = []
-    for words, value in PROTOCOL.items():
-        values = sorted({value(record) for record in records} - {None})
-        if len(values) > 1:
-            listed = ", ".join(map(str, values[:5])) + (", …" if len(values) > 5 else "")
-            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
-    return notes
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
