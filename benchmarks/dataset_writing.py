@@ -31,6 +31,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import av
 import numpy as np
 
+from lerobot_memobench.constants import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, labels
 from lerobot_memobench.datasets.generate import generate
@@ -43,7 +44,6 @@ from lerobot_memobench.datasets.layout import (
     image_key,
 )
 from lerobot_memobench.datasets.write import write_dataset
-from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, DEMONSTRATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.published_files import write_published
 from tests.support.short_demonstrations import record_demonstration

@@ -28,6 +28,7 @@ from random_weights import materialise
 from torch import Tensor
 from turns import medians
 
+from lerobot_memobench.constants import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.io import in_words
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
@@ -37,7 +38,6 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
-from lerobot_memobench.protocol import CONTROL_HZ, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.training.loop import keep_freed_memory
 

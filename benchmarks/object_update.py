@@ -26,12 +26,12 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_LANGUAGE_ATTENTION_MASK
 from policies import MEMORY_FRAMES, config, observation, training_batch, updates
 from turns import Worker, answer_requests
 
+from lerobot_memobench.constants import OBS_PHASE, OBS_STEP
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
-from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.training.loop import keep_freed_memory
 

@@ -17,8 +17,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from turns import medians
 
+from lerobot_memobench.constants import VALIDATION_SEED
 from lerobot_memobench.envs.episode import Episode
-from lerobot_memobench.protocol import VALIDATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 
 

@@ -20,7 +20,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.monitor import Monitor
 
 import lerobot_memobench.envs  # noqa: F401  registers memobench/<task>-v0
-from lerobot_memobench.protocol import DEMONSTRATION_SEED, VALIDATION_SEED
+from lerobot_memobench.constants import DEMONSTRATION_SEED, VALIDATION_SEED
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes
 

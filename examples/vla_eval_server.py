@@ -31,9 +31,9 @@ from vla_eval.specs import (
     DimSpec,
 )
 
+from lerobot_memobench.constants import EXECUTION, PROMPT
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.compatibility import trained_convention
-from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED, UPRIGHT
 
 CAMERAS = {"agentview": "image", "wrist": "wrist_image"}

@@ -203,7 +203,7 @@ def command_parts(path: str, command: Any) -> Iterator[str]:
 
 def spaces_page() -> str:
     """Return the page of observation and action spaces."""
-    from lerobot_memobench import protocol
+    from lerobot_memobench import constants
     from lerobot_memobench.datasets.layout import ACTION_NAMES, PROPRIO_NAMES
     from lerobot_memobench.envs import observations
     from lerobot_memobench.envs.pacing import longest
@@ -245,7 +245,7 @@ def spaces_page() -> str:
     bounds = dict.fromkeys("xyz", "m, ±1 is ±0.05") | {"gripper": "−1 opens, +1 closes"}
     parts = [
         "# Observation and action spaces",
-        f"{protocol.CONTROL_HZ} control steps per second. Horizon {protocol.HORIZON:,} execution steps.",
+        f"{constants.CONTROL_HZ} control steps per second. Horizon {constants.HORIZON:,} execution steps.",
         "## Observations",
         table(["environment", "policy", "shape", "type", "content"], rows),
         "The instruction is the text `task`.",
@@ -259,7 +259,7 @@ def spaces_page() -> str:
             [[code(name), str(STARTS[name]), str(size), slots[name]] for name, size in FIELDS.items()],
         ),
         "## Actions",
-        f"Shape ({protocol.ACTION_DIM},), float32, in [−1, 1]: pose delta of the end effector, and gripper.",
+        f"Shape ({constants.ACTION_DIM},), float32, in [−1, 1]: pose delta of the end effector, and gripper.",
         table(
             ["index", "name", "unit"],
             [[str(k), code(name), bounds.get(name, "rad, ±1 is ±0.5")] for k, name in enumerate(ACTION_NAMES)],
@@ -279,9 +279,9 @@ def flat(space: Any, above: str = "") -> Iterator[tuple[str, Any]]:
 
 def dataset_page() -> str:
     """Return the page of a dataset's columns."""
+    from lerobot_memobench.constants import IMAGE_SIZE
     from lerobot_memobench.datasets.episodes import DemonstrationRecord
     from lerobot_memobench.datasets.layout import MEANINGS, OBJECTS, dataset_features
-    from lerobot_memobench.protocol import IMAGE_SIZE
 
     features = {OBJECTS: dataset_features(None)[OBJECTS], **dataset_features((IMAGE_SIZE, IMAGE_SIZE))}
     rows = [

@@ -16,9 +16,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import DEMONSTRATION_SEED, PROMPT
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.io import write_file
-from lerobot_memobench.protocol import DEMONSTRATION_SEED, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.gap import GAPS_FILE, cue_in_prompt

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from lerobot_memobench.constants import CONTROL_HZ, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.protocol import CONTROL_HZ, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.catalogue import get_task
 

@@ -30,7 +30,7 @@ from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run.card import encoded, git, training_facts
+from lerobot_memobench.rollouts.card import encoded, git, training_facts
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
 

@@ -92,7 +92,7 @@ def command(program: str, *words: object) -> None:
 
 def words_to_plan(folder: Path) -> list[Functions]:
     """Trace ``lerobot eval`` until the plan is complete, and stop the command there."""
-    from lerobot_memobench.run.plan import EvaluationPlan
+    from lerobot_memobench.rollouts.plan import EvaluationPlan
 
     create, trace = EvaluationPlan.__init__, Trace()
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
-from lerobot_memobench.run.command_line import parse_words
-from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.rollouts.plan import take_run_options
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import rollout, write_log
 

@@ -25,11 +25,7 @@ from lerobot.scripts.lerobot_edit_dataset import EditDatasetConfig
 from PIL import Image
 
 from lerobot_memobench.cli import memobench
-from lerobot_memobench.envs import episode_log, evaluation_file
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.metrics import Rate
-from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     HELP,
     is_of_benchmark,
     parse_words,
@@ -38,8 +34,12 @@ from lerobot_memobench.run.command_line import (
     spelled,
     typed,
 )
-from lerobot_memobench.run.plan import take_run_options
-from lerobot_memobench.run.settings import read_settings
+from lerobot_memobench.envs import episode_log, evaluation_file
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import Rate
+from lerobot_memobench.policies.memobench_mem.memory import OURS
+from lerobot_memobench.rollouts.plan import take_run_options
+from lerobot_memobench.rollouts.settings import read_settings
 from lerobot_memobench.training.command import take_training_options
 from research import kept
 from tests.support.logs import rollout, write_log
@@ -274,7 +274,7 @@ def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
 def test_rows_of_evidence_are_recomputed(tmp_path: Path) -> None:
     """One scene of two variants, of which both were answered by the first."""
     task = "put_the_butter_into_the_bowl_from_the_prompt_video"
-    asked = [{"episode": k, "variant": k, "variants": 2, "choice": 0, "chance": 0.5} for k in (0, 1)]
+    asked = [{"episode": k, "seed": 7, "variant": k, "variants": 2, "choice": 0, "chance": 0.5} for k in (0, 1)]
     lines = [rollout(task, "object", "S", [True], one["choice"] == one["variant"], 7) | one for one in asked]
     keep_one(tmp_path, lines)
     page, log = tmp_path / "page.md", ONE
@@ -487,7 +487,7 @@ def test_all_fields_of_log_and_card_have_a_meaning() -> None:
         episode_log.CheckpointRecord,
         evaluation_file.Protocol,
         evaluation_file.Card,
-        evaluation_file.CardEpisode,
+        evaluation_file.CardSettings,
     ):
         assert all(meaning for _, meaning, _ in reference.typed_rows(kind)), kind
     rows = reference.typed_rows(episode_log.EpisodeRecord)

@@ -15,8 +15,8 @@ from lerobot_memobench import doctor
 from lerobot_memobench.cli import memobench
 from lerobot_memobench.cli.console import console
 from lerobot_memobench.cli.memobench import finding_table
+from lerobot_memobench.constants import PUBLISHED_MUJOCO
 from lerobot_memobench.doctor import Finding
-from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.simulation import Simulation
 
 

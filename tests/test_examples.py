@@ -16,11 +16,11 @@ import pytest
 import torch
 
 from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import RemoteConfig, RemotePolicy
 from lerobot_memobench.policies.remote_connection import pack, unpack
-from lerobot_memobench.run.command_line import parse_words, read_words
-from lerobot_memobench.run.plan import take_run_options
+from lerobot_memobench.rollouts.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
 from tests.support import logs

@@ -18,9 +18,9 @@ from lerobot_memobench.cli.lerobot import help_of
 from lerobot_memobench.envs.episode_log import read_log, write_episodes
 from lerobot_memobench.envs.evaluation_file import Acting, differences, facts_of, write_facts
 from lerobot_memobench.evaluation.comparison import ALLOWED
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.settings import settings_of
+from lerobot_memobench.rollouts.card import card_of
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.settings import settings_of
 from tests.support.scripts import load_script
 
 line = ["env=memobench", "policy=memobench_random", "episodes=1", "tasks=1"]

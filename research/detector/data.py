@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.record import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, read_json, write_file
 from lerobot_memobench.jobs.processes import Advance
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.protocol import SPLITS
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 from mujoco_raster.highlights import Highlight

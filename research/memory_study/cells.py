@@ -10,9 +10,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.command_line import parse_words
 from research.memory_study.commands import Cost, check_training, has_ended, kept_of, run_once, train_once
 from research.memory_study.grid import POLICY, ROLLOUTS, SEALED, TRAINING, Grid, folder_name, word_of
 
@@ -170,8 +170,8 @@ class Cell:
         Raises:
             MemobenchError: an unknown setting or value, with the nearest known one.
         """
-        from lerobot_memobench.run.plan import take_run_options
-        from lerobot_memobench.run.settings import read_settings
+        from lerobot_memobench.rollouts.plan import take_run_options
+        from lerobot_memobench.rollouts.settings import read_settings
 
         words = self.training_words()
         check_training(words)

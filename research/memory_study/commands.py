@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, NotRequired, TypedDict
 
+from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import read_json, write_file
 from lerobot_memobench.jobs.threads import sharing
-from lerobot_memobench.run.command_line import parse_words
 
 MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
 
@@ -150,7 +150,7 @@ def check_training(words: Sequence[str]) -> None:
     Raises:
         MemobenchError: an unknown setting or value, with the nearest known one.
     """
-    from lerobot_memobench.run.command_line import read_words
+    from lerobot_memobench.commands.command_line import read_words
     from lerobot_memobench.training.command import take_training_options
 
     *_, rest = take_training_options(parse_words([word for word in words[2:] if not word.startswith("dataset=")]))

@@ -14,7 +14,7 @@ import pytest
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.threads import PROCESSES
-from lerobot_memobench.run.card import run_facts
+from lerobot_memobench.rollouts.card import run_facts
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from research.kept import keep, restore
 from research.memory_study import cells, commands

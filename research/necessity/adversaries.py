@@ -26,13 +26,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import ACTION_DIM, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.evaluation.metrics import wilson
 from lerobot_memobench.experts.expert import Expert, plan_of
 from lerobot_memobench.experts.hand import OPEN, UP
 from lerobot_memobench.experts.travel import opening_direction, release_fixture, rise
-from lerobot_memobench.protocol import ACTION_DIM, EXECUTION, VALIDATION_SEED
 from lerobot_memobench.sim.asset import split_class
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes

@@ -4,7 +4,7 @@
 
 After each hold such a policy chooses from the elapsed steps what to begin next, or to wait, because the observation
 is always the same. It waits near home, where no rest is counted, as long as the horizon allows. Holds of random
-length (`protocol.HOLD_MEAN`) blur the steps, but elapsed time grows with each event, so no law makes it worthless.
+length (`constants.HOLD_MEAN`) blur the steps, but elapsed time grows with each event, so no law makes it worthless.
 The steps are divided into bins; each has one choice or the wait. A random choice could not be better: a bin is
 shorter than an event, so an episode uses it once. Changes of random intervals of bins are kept unless the rate falls.
 The best plan of several starts is rated on other sampled episodes: on its own sample its rate is up to six points
@@ -20,7 +20,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.protocol import HOLD_MEAN, HOLD_SHAPE, HORIZON, LONGEST_HOLD
+from lerobot_memobench.constants import HOLD_MEAN, HOLD_SHAPE, HORIZON, LONGEST_HOLD
 
 Array = NDArray[np.float64]
 Plan = NDArray[np.int64]

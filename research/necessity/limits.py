@@ -19,9 +19,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import LONGEST_HOLD, VALIDATION_SEED
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.protocol import LONGEST_HOLD, VALIDATION_SEED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.command import run

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom, gamma
 
+from lerobot_memobench.constants import LONGEST_HOLD
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import LONGEST_HOLD
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from research.necessity.adversaries import (
     DECLARED,

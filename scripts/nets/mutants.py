@@ -16,7 +16,7 @@ COPIED = ("src", "scripts", "research", "results", "docs", "README.md", "pyproje
 MUTANTS = """
 hold ~ logs ~ difficulty=hard ~ self._held = steps + -( ~ self._held = steps + 1 + -(
 cameras ~ starts ~ turn_it_off-v0 ~ "agentview": AGENTVIEW, "wrist": robot ~ "wrist": AGENTVIEW, "agentview": robot
-predicate ~ executions ~ published 24 ~ ON_DISTANCE = 0.03 ~ ON_DISTANCE = 0.01
+predicate ~ executions ~ published 24 ~ return self.touching(a, b) ~ return True
 normalisation ~ weights ~ objects none ~ "STATE": mode, ~ "STATE": NormalizationMode.IDENTITY,
 loss ~ weights ~ objects motion ~ per_sample + loss, total + loss.mean() ~ per_sample, total
 salt ~ actions ~ memobench_strict put_only ~ stream, *salted] ~ stream]

@@ -15,10 +15,10 @@ from typing import Literal
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
+from lerobot_memobench.constants import PUBLISHED_MUJOCO
 from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.protocol import PUBLISHED_MUJOCO
 from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
 from lerobot_memobench.tasks.catalogue import get_task
 

@@ -20,14 +20,14 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.commands.command_line import OPTIONS, SHORT_FORMS, parse_words
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import check_checkpoint, checkpoint_folder
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.command_line import OPTIONS, SHORT_FORMS, parse_words
-from lerobot_memobench.run.plan import EvaluationPlan
+from lerobot_memobench.rollouts.plan import EvaluationPlan
 from lerobot_memobench.training.command import with_last_checkpoint
 from tests.support import logs
 from tests.support.fake_loop import STOVE, FakeLoop

@@ -303,7 +303,7 @@ COMMON += ["eval.use_async_envs=false"]  # rows in one process: workers would st
 @pytest.fixture(scope="module")
 def server() -> Iterator[ForkServer]:
     """Forks of a process with LeRobot: its import takes longer than an episode."""
-    modules = ("lerobot_memobench.envs.env", "lerobot_memobench.run.run", "lerobot_memobench.cli.lerobot")
+    modules = ("lerobot_memobench.envs.env", "lerobot_memobench.rollouts.evaluate", "lerobot_memobench.cli.lerobot")
     forks = ForkServer(modules)
     yield forks
     forks.close()

@@ -13,12 +13,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lerobot_memobench.constants import NO_CLOCK
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames, labels
 from lerobot_memobench.datasets.episodes import read_episode
 from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
 from lerobot_memobench.datasets.write import write_dataset
-from lerobot_memobench.protocol import NO_CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
 from lerobot_memobench.tasks.catalogue import get_task, suite_of, task_names
 from lerobot_memobench.tasks.task import STRICT

@@ -18,6 +18,7 @@ from lerobot.envs import env_to_policy_features, preprocess_observation
 from lerobot.processor.env_processor import LiberoProcessorStep
 
 import lerobot_memobench.envs  # noqa: F401
+from lerobot_memobench.constants import EXECUTION, PROMPT
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_log
 from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
@@ -27,7 +28,6 @@ from lerobot_memobench.envs.video import BAND
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.protocol import EXECUTION, PROMPT
 from tests.support.logs import protocol_of
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

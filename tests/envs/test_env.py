@@ -20,6 +20,7 @@ from lerobot.configs import FeatureType
 from lerobot.envs import env_to_policy_features, preprocess_observation
 
 import lerobot_memobench.envs
+from lerobot_memobench.constants import ENDED, EXECUTION, LONGEST_HOLD, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.datasets.demonstration import labels
 from lerobot_memobench.envs import env as environment
 from lerobot_memobench.envs import episode as episode_module
@@ -34,7 +35,6 @@ from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import failure_of
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.protocol import ENDED, EXECUTION, LONGEST_HOLD, NO_CLOCK, PROMPT, PROMPT_HORIZON, UNSEEDED
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.tasks.catalogue import get_task, task_names

@@ -13,12 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lerobot_memobench.envs.episode import Episode, referent_of
-from lerobot_memobench.envs.episode_log import episode_record
-from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
-from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     EXECUTION,
     HORIZON,
     PAPER,
@@ -26,6 +21,11 @@ from lerobot_memobench.protocol import (
     SPLITS,
     VALIDATION,
 )
+from lerobot_memobench.envs.episode import Episode, referent_of
+from lerobot_memobench.envs.episode_log import episode_record
+from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, Formula, Never, Then
 from lerobot_memobench.tasks.task import STRICT, Task

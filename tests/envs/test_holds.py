@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import HOLD_MEAN, LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.pacing import Pacing, shortest_hold
 from lerobot_memobench.envs.settings import BOTH, EnvSettings
-from lerobot_memobench.protocol import HOLD_MEAN, LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.constants import EXECUTION, PROMPT
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import differences, read_evaluation
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION, PROMPT
 from tests.support.logs import protocol_of
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

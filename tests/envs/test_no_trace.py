@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import NO_CLOCK, PROMPT
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
@@ -20,7 +21,6 @@ from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.hand import Hand
 from lerobot_memobench.experts.travel import come_home
-from lerobot_memobench.protocol import NO_CLOCK, PROMPT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation

@@ -11,6 +11,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
+from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.envs.observations import Observer, check_obs_type, obs_type_of, policy_inputs
 from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
@@ -21,7 +22,6 @@ from lerobot_memobench.policies.baselines import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.remote import RemoteConfig
-from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import SIZE
 
 STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.envs import episode as episode_module
 from lerobot_memobench.envs import prompts
 from lerobot_memobench.envs.env import MemobenchEnv
@@ -20,7 +21,6 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.prompts import PromptPlayer, RestoredPrompt, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET, STEPS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim.simulation import NO_OP, STABILISATION_STEPS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom

@@ -15,6 +15,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.constants import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.evaluation_file import (
@@ -30,7 +31,6 @@ from lerobot_memobench.envs.evaluation_file import (
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import STRICT
 

@@ -11,8 +11,8 @@ import av
 import numpy as np
 import pytest
 
+from lerobot_memobench.constants import EXECUTION, PROMPT
 from lerobot_memobench.envs.video import BAND, LAST_FRAMES, MARGIN, OPERATION_COLOURS, VideoRecorder, annotate
-from lerobot_memobench.protocol import EXECUTION, PROMPT
 from lerobot_memobench.tasks.catalogue import get_task
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

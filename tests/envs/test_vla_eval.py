@@ -19,12 +19,12 @@ from vla_eval.registry import resolve_import_string
 from vla_eval.specs import check_specs
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.constants import EXECUTION, NO_CLOCK
 from lerobot_memobench.envs import episode as episodes
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import report_values, summary_of
-from lerobot_memobench.protocol import EXECUTION, NO_CLOCK
 from lerobot_memobench.vla_eval import MEMOBench
 from tests.support.remote_case import free_port
 from tests.support.vla_eval_server import DigestServer
@@ -191,7 +191,6 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
         ({"history_every": 0}, "history_every"),
         ({"seed": 100_007}, "test-sealed"),
         ({"obs_type": "both"}, "send_state"),
-        ({"mirror": True}, "'mirror'"),
         ({"evidence": True}, "referent"),
         ({"suite": "strict"}, "set replan_steps"),
         ({"n_action_steps": 4, "replan_steps": 6}, "multiple of n_action_steps=4"),

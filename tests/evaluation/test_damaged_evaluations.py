@@ -13,9 +13,9 @@ import pytest
 from lerobot_memobench.cli.report import ReportFormat, compare, merge, report
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.evaluation_file import check_facts, write_evaluation
-from lerobot_memobench.run import rerun as again
-from lerobot_memobench.run.plan import earlier_batch_size
-from lerobot_memobench.run.run import resumed_card
+from lerobot_memobench.rollouts import rerun as again
+from lerobot_memobench.rollouts.evaluate import resumed_card
+from lerobot_memobench.rollouts.plan import earlier_batch_size
 from tests.support import logs, mutations
 
 STOVE, DRAWER = "press_the_stove_button_four_times", "two_of_them"
@@ -78,8 +78,8 @@ class Bench:
 
     def rerun(self) -> None:
         """All that `memobench rerun` does with a card before and after the run."""
-        card = again.repeatable_card(self.run)
-        again.check_policy(card)
+        card, settings = again.read_repeatable(self.run)
+        again.check_policy(card, settings.policy_path)
         again.differences_here(card)
 
     def use(self, rng: random.Random) -> object:

@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lerobot_memobench.constants import EXECUTION, HORIZON
 from lerobot_memobench.datasets.record import HOLD_FRAMES
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert, final_atoms, steps_of
 from lerobot_memobench.experts.hand import MAX_OPENING_STEPS, OPEN, Hand
 from lerobot_memobench.experts.travel import PRESS_STEPS
-from lerobot_memobench.protocol import EXECUTION, HORIZON
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names

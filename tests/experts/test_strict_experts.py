@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import EXECUTION
 from lerobot_memobench.datasets.record import RecordingSettings, compiled_episode, record
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import plan_of
@@ -15,7 +16,6 @@ from lerobot_memobench.experts.fixtures import close_drawer, open_drawer
 from lerobot_memobench.experts.grasping import pick, put_on
 from lerobot_memobench.experts.hand import OPEN, Hand
 from lerobot_memobench.experts.travel import Held
-from lerobot_memobench.protocol import EXECUTION
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom

@@ -18,12 +18,12 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
-from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training import loop
 from lerobot_memobench.training.command import complete_training
 

@@ -23,6 +23,7 @@ from lerobot.processor import ProcessorStep, ProcessorStepRegistry
 from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.commands.command_line import checkpoint_of, chosen_class, parse_words, read_words
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
@@ -39,8 +40,7 @@ from lerobot_memobench.policies.compatibility import cameras_read, check_feature
 from lerobot_memobench.policies.memobench_mem.checkpoints import require_agreement
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.run.card import training_facts
-from lerobot_memobench.run.command_line import checkpoint_of, chosen_class, parse_words, read_words
+from lerobot_memobench.rollouts.card import training_facts
 from tests.support import mutations
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -12,6 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_policy_memobench  # noqa: F401  (registers the environment)
+from lerobot_memobench.commands.command_line import recipe_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     MEMORY,
@@ -23,7 +24,6 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
-from lerobot_memobench.run.command_line import recipe_file
 
 OBJECTS = {"size": "small", "perception": "objects"}
 

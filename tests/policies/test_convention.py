@@ -16,12 +16,12 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import chosen_convention
-from lerobot_memobench.run.command_line import parse_words
-from lerobot_memobench.run.plan import plan_line, with_names
-from lerobot_memobench.run.settings import read_settings
+from lerobot_memobench.rollouts.plan import plan_line, with_names
+from lerobot_memobench.rollouts.settings import read_settings
 from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
 
@@ -172,7 +172,7 @@ def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
     path = saved(tmp_path, NUMBERED, rename_map=RENAMED_LIBERO)
     line = ["env=memobench", f"tasks={STOVE}", "episodes=1", f"policy={path}"]
     plan = plan_line([*line, f"camera_name_mapping={json.dumps(names)}"])
-    assert plan.settings.portable["env"]["camera_name_mapping"] == names
+    assert plan.environment.camera_name_mapping == names
     assert plan.environment.features_map["pixels/camera2"] == "observation.images.camera2"
     unclear = saved(tmp_path / "unclear", NUMBERED)
     mapping = f"camera_name_mapping={json.dumps(names)}"

@@ -22,7 +22,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.baselines import MemobenchRandomConfig
 from lerobot_memobench.policies.lerobot_config import acting, check_sizes
-from lerobot_memobench.run.shards import merge
+from lerobot_memobench.rollouts.shards import merge
 from lerobot_memobench.sim.object_layout import SIZE
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -22,7 +22,7 @@ from lerobot_memobench.policies.baselines import (
     MemobenchRandomConfig,
     MemobenchRandomPolicy,
 )
-from lerobot_memobench.run.rollout import CHUNKED, ActionQueue, plans_chunks
+from lerobot_memobench.rollouts.rollout import CHUNKED, ActionQueue, plans_chunks
 from tests.support.policy_server import PolicyServer
 from tests.support.remote_case import counting, make
 from tests.support.small_policy import made_for_training

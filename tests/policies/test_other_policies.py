@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.commands.lerobot_commands import call_lerobot
 from lerobot_memobench.conformance.streams import write_streams
+from lerobot_memobench.constants import EXECUTION, PROMPT
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
-from lerobot_memobench.protocol import EXECUTION, PROMPT
-from lerobot_memobench.run.lerobot_commands import call_lerobot
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.lerobots_trainer import trainer_in_this_process
 from tests.support.logs import protocol_of

@@ -16,6 +16,7 @@ from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from lerobot_memobench.constants import ENDED, EXECUTION, NO_CLOCK, PROMPT
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
@@ -24,7 +25,6 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import (
     WordTokenizerProcessorStep,
 )
 from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory, Rollout
-from lerobot_memobench.protocol import ENDED, EXECUTION, NO_CLOCK, PROMPT
 from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.data import Training
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS

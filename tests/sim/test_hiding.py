@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import Expert
-from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.constants import PAPER, PUBLISHED_MUJOCO, SPLITS
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import notes_on
-from lerobot_memobench.protocol import PAPER, PUBLISHED_MUJOCO, SPLITS
 from lerobot_memobench.sim.asset import TABLE
 from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import NO_OP, Simulation

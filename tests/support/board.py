@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.submission import CARD, LOG
+from lerobot_memobench.constants import EVIDENCE_EPISODES
 from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.policies.lerobot_config import tree_hash
-from lerobot_memobench.protocol import EVIDENCE_EPISODES
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.evidence import chance, scene_and_variant
 from lerobot_memobench.tasks.task import STRICT

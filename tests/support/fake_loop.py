@@ -13,7 +13,7 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
-from lerobot_memobench.run.plan import Cell, EvaluationPlan
+from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.task import Task
 
@@ -26,7 +26,7 @@ class Killed(Exception):
 
 
 class FakeLoop:
-    """Replacement of `run.evaluate.evaluate` that records its arguments.
+    """Replacement of `rollouts.evaluate.evaluate` that records its arguments.
 
     Attributes:
         plans: of each call. cells: batches of each call.
@@ -95,10 +95,10 @@ def fake_loop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> FakeLoop:
     """The loop is replaced, and the current folder is an empty one."""
     import lerobot_policy_memobench  # noqa: F401 - LeRobot would find it by a search of all installed packages
 
-    monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.commands.command_line.register_plugins", lambda: None)
     monkeypatch.chdir(tmp_path)
     fake = FakeLoop()
-    monkeypatch.setattr("lerobot_memobench.run.run.evaluate", fake)
+    monkeypatch.setattr("lerobot_memobench.rollouts.evaluate.evaluate", fake)
     return fake
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import EpisodeRecord, write_episodes
 from lerobot_memobench.envs.evaluation_file import FORMAT, has_evaluation, read_evaluation, write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.run.card import run_facts
+from lerobot_memobench.rollouts.card import run_facts
 
 Mark = tuple[str, int | None, int | None]
 """A checkpoint of a rollout: operation, first step, ordered step."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.episodes import DemonstrationRecord
 from lerobot_memobench.datasets.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
-from lerobot_memobench.protocol import CLOCK
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import DEMO_TASK
 from tests.support.synthetic_dataset import clock_at

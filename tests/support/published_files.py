@@ -11,9 +11,9 @@ from typing import Any
 import h5py
 import numpy as np
 
+from lerobot_memobench.constants import CONTROL_HZ
 from lerobot_memobench.datasets.demonstration import Demonstration, key_frames
 from lerobot_memobench.datasets.hdf5 import IMAGE_NAMES
-from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.task import BDDL_FILE, METADATA_FILE, Task
 from tests.support.libero_layout import libero_scene
 

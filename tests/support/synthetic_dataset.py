@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_memobench.protocol import CLOCK, EXECUTION, PROMPT
+from lerobot_memobench.constants import CLOCK, EXECUTION, PROMPT
 
 SIZE = 48  # pixels of the synthetic cameras
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")

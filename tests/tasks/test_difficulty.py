@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record, read_log, write_episodes
 from lerobot_memobench.envs.evaluation_file import write_evaluation
@@ -16,7 +17,6 @@ from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import protocol_phrases
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DIFFICULTIES, STANDARD, STRICT, Difficulty
 from tests.support.logs import facts

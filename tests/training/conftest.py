@@ -44,7 +44,7 @@ def train() -> Callable[..., None]:
     """Train a memory policy by the words of ``lerobot train``."""
 
     def run(*words: str) -> None:
-        from lerobot_memobench.run.command_line import parse_words, read_words
+        from lerobot_memobench.commands.command_line import parse_words, read_words
         from lerobot_memobench.training.command import complete_training, with_last_checkpoint
         from lerobot_memobench.training.loop import train as loop
 

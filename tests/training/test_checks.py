@@ -11,9 +11,9 @@ import pytest
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 
+from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training.command import READ, check_settings, complete_training
 from lerobot_memobench.training.data import open_metadata
 from lerobot_memobench.training.loop import begin

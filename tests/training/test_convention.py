@@ -18,13 +18,13 @@ from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.memobench import main as memobench
+from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.conformance.subject import load_subject
 from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.objects import VIEWS
-from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.data import check_environment
 from lerobot_memobench.training.features import detected_slots

@@ -13,9 +13,9 @@ from lerobot.policies import make_pre_post_processors
 from safetensors import safe_open
 from safetensors.torch import load_file
 
+from lerobot_memobench.constants import OBS_PHASE, OBS_STEP
 from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.protocol import OBS_PHASE, OBS_STEP
 from lerobot_memobench.training.average import TRAINING_FILE
 from tests.training.conftest import hashes, read_losses
 

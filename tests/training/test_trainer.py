@@ -18,10 +18,10 @@ from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_train
 from torch.utils.data import DataLoader
 
+from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.command_line import parse_words, read_words
 from lerobot_memobench.training import trainer
 from lerobot_memobench.training.trainer import keep_in_memory, open_trainer_datasets, prepare
 from tests.support.held_dataset import make_held_dataset

@@ -14,12 +14,12 @@ from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
 from lerobot_memobench.board.submission import PAUSES, Evaluation
+from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
 from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.evaluation_file import POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
-from lerobot_memobench.run.card import PACKAGES
+from lerobot_memobench.rollouts.card import PACKAGES
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 

@@ -1,7 +1,7 @@
 """The command ``lerobot``: ``lerobot <name> key=value …`` runs LeRobot's ``lerobot-<name>``.
 
 ``lerobot eval env=memobench`` and ``lerobot train`` check their settings, set the benchmark's defaults and run loops of
-their own (``run.plan``, ``training.command``). For any other command ``key=value`` becomes ``--key=value``.
+their own (``rollouts.plan``, ``training.command``). For any other command ``key=value`` becomes ``--key=value``.
 """
 
 from __future__ import annotations
@@ -22,12 +22,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from lerobot_memobench.cli.console import WITH_PARENT, as_path, console, counting, note, run_command, say
-from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import explaining_disk_errors
-from lerobot_memobench.jobs.processes import adding_resume_hint
-from lerobot_memobench.jobs.threads import ACTING, use_threads
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     CONFIG_FILE,
     HELP,
     PACKAGES,
@@ -42,14 +37,19 @@ from lerobot_memobench.run.command_line import (
     spelled,
     without,
 )
-from lerobot_memobench.run.lerobot_commands import call_lerobot, lerobot_commands
+from lerobot_memobench.commands.lerobot_commands import call_lerobot, lerobot_commands
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.io import explaining_disk_errors
+from lerobot_memobench.jobs.processes import adding_resume_hint
+from lerobot_memobench.jobs.threads import ACTING, use_threads
 from lerobot_memobench.tasks.catalogue import lerobots_choice, resolve_tasks
 from lerobot_memobench.tasks.task import PUBLISHED
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records import Run
     from lerobot_memobench.jobs.processes import Advance
-    from lerobot_memobench.run.plan import EvaluationPlan
+    from lerobot_memobench.rollouts.plan import EvaluationPlan
 
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 """Arguments of Python that start the process of one part."""
@@ -121,7 +121,7 @@ def evaluate(words: Mapping[str, str]) -> int:
     suites = check_tasks(words)
     if len(suites) > 1:
         return evaluate_suites(suites, words)
-    from lerobot_memobench.run.plan import plan_words
+    from lerobot_memobench.rollouts.plan import plan_words
 
     plan = plan_words(words)
     hint = f"resume with: {plan.resuming_command}"
@@ -195,7 +195,7 @@ def flags_of_other(words: Mapping[str, str]) -> list[str]:
 
 def evaluate_here(plan: EvaluationPlan) -> int:
     """Run an evaluation, or a part of one, and print its report."""
-    from lerobot_memobench.run.run import run_evaluation
+    from lerobot_memobench.rollouts.evaluate import run_evaluation
 
     with counting(console(), "episodes") as count:
         report = run_evaluation(plan, note, say, count)
@@ -208,7 +208,7 @@ def evaluate_here(plan: EvaluationPlan) -> int:
 
 def evaluate_in_parts(plan: EvaluationPlan) -> int:
     """Run all parts of an evaluation as jobs, merge them and print the report; 1 when episodes are missing."""
-    from lerobot_memobench.run.shards import plan_shards, run_shards
+    from lerobot_memobench.rollouts.shards import plan_shards, run_shards
 
     jobs = plan_shards(plan, SHARD_PROGRAM, note)
     with counting(console(), "parts", len(jobs)) as count:

@@ -22,11 +22,11 @@ from lerobot_memobench.cli import data
 from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console, note, run_app, say, table
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, export, merge, report, rerun, submit
+from lerobot_memobench.constants import SEALED
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import count_of, in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
-from lerobot_memobench.protocol import SEALED
 from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     get_task,
@@ -181,7 +181,7 @@ def recipe(
     name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
 ) -> int:
     """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
-    from lerobot_memobench.run.command_line import recipe_file, recipes
+    from lerobot_memobench.commands.command_line import recipe_file, recipes
 
     if name is not None:
         print(recipe_file(name))

@@ -125,7 +125,7 @@ def merge(
 ) -> int:
     """Join the parts of an evaluation and report the whole. They ran with shard=i/n. Status 1: some are missing."""
     from lerobot_memobench.cli.lerobot import print_report
-    from lerobot_memobench.run.shards import merge_and_report, part_folders
+    from lerobot_memobench.rollouts.shards import merge_and_report, part_folders
 
     return print_report(merge_and_report(out, folders or part_folders(out)))
 
@@ -140,7 +140,7 @@ def rerun(
 ) -> int:
     """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""
     from lerobot_memobench.cli.lerobot import evaluate_here
-    from lerobot_memobench.run.rerun import repeat
+    from lerobot_memobench.rollouts.rerun import repeat
 
     return repeat(card, out, server, evaluate_here, say)
 

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_memobench.constants import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.write import write_dataset
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, CLOCK, EXECUTION, IMAGE_SIZE, OBS_PHASE, PROPRIO_DIM
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.tasks.catalogue import get_task, task_names

@@ -16,7 +16,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
+from lerobot_memobench.commands.command_line import (
+    PATH,
+    SHORT_FORMS,
+    parse_words,
+    policy_config,
+    read_words,
+    setting_kind,
+)
 from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.layout import objects_column
@@ -26,9 +35,7 @@ from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.checkpoint import check_weights
 from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
-from lerobot_memobench.protocol import CLOCK
-from lerobot_memobench.run.command_line import PATH, SHORT_FORMS, parse_words, policy_config, read_words, setting_kind
-from lerobot_memobench.run.rollout import ActionQueue
+from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 

@@ -24,6 +24,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from lerobot_memobench.constants import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
 from lerobot_memobench.datasets.generate import check_room, run_size
@@ -62,7 +63,6 @@ from lerobot_memobench.io import (
 )
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
-from lerobot_memobench.protocol import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
 

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     ACTION_DIM,
     CAMERAS,
     CONTROL_HZ,
@@ -27,6 +26,7 @@ from lerobot_memobench.protocol import (
     PROMPT,
     PROPRIO_DIM,
 )
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, STRICT, Task

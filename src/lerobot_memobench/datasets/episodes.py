@@ -20,6 +20,7 @@ from annotated_types import Ge, Le
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from lerobot_memobench.constants import CONTROL_HZ
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames
 from lerobot_memobench.datasets.layout import (
     ADVICE,
@@ -46,7 +47,6 @@ from lerobot_memobench.io import (
     refusing,
     short,
 )
-from lerobot_memobench.protocol import CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import suite_of
 
 if TYPE_CHECKING:

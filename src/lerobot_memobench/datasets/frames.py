@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lerobot_memobench.constants import OBS_PHASE, PROMPT
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
 from lerobot_memobench.datasets.episodes import numbers, read_table, tables_of, texts
 from lerobot_memobench.datasets.layout import OBJECTS, PRIVILEGED, objects_column
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import OBS_PHASE, PROMPT
 
 _PLACE = ("index", "episode_index", "frame_index")
 

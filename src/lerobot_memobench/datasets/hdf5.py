@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Malformed,
@@ -35,7 +36,6 @@ from lerobot_memobench.io import (
     parsed,
     refusing,
 )
-from lerobot_memobench.protocol import ACTION_DIM
 
 if TYPE_CHECKING:
     import h5py

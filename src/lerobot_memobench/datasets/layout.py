@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lerobot_memobench.constants import CAMERAS, OBS_PHASE, OBS_STEP
 from lerobot_memobench.datasets.demonstration import (
     HELD_COLUMN,
     INSTRUCTION_COLUMN,
@@ -18,7 +19,6 @@ from lerobot_memobench.datasets.demonstration import (
     MEMORY_COLUMN,
 )
 from lerobot_memobench.io import cache_folder, files_below
-from lerobot_memobench.protocol import CAMERAS, OBS_PHASE, OBS_STEP
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.sim.object_layout import NAMES
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import EXECUTION, IMAGE_SIZE
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.stage import EpisodeStage, StagedJob, stage_failure
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import EXECUTION, IMAGE_SIZE
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.simulation import RenderSettings
 from lerobot_memobench.tasks.task import Task

@@ -24,11 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lerobot_memobench.constants import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5 import NO_SEED, SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name
-from lerobot_memobench.protocol import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.convention import UPRIGHT
 from lerobot_memobench.sim.object_slots import ObjectSlots

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
 from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, is_dataset
@@ -37,7 +38,6 @@ from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
-from lerobot_memobench.protocol import CAMERAS
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
 
 TEMPORARY = ".tmp-"

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
 from lerobot_memobench.datasets.layout import ADVICE, STATS_FILE
@@ -19,7 +20,6 @@ from lerobot_memobench.datasets.video import ImageHistograms, Stats, frame_reade
 from lerobot_memobench.datasets.write import numeric_stats
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, read_json, short, write_file
-from lerobot_memobench.protocol import CLOCK
 
 IMAGES, TEXTS = ("video", "image"), ("string", "language")
 BLOCK = 64

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import (
     Columns,
@@ -52,7 +53,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
 from lerobot_memobench.jobs.processes import process_pool
-from lerobot_memobench.protocol import CAMERAS, CONTROL_HZ, IMAGE_SIZE
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation

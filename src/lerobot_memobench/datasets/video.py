@@ -30,10 +30,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from lerobot_memobench.constants import CONTROL_HZ
 from lerobot_memobench.datasets.episodes import naming_damage, undamaged
 from lerobot_memobench.datasets.layout import without_pattern
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CONTROL_HZ
 
 if TYPE_CHECKING:
     from lerobot.configs import RGBEncoderConfig

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import CLOCK, CONTROL_HZ
 from lerobot_memobench.datasets.card import write_card
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
 from lerobot_memobench.datasets.episodes import ListedEpisode
@@ -48,7 +49,6 @@ from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, vide
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, files_below, write_file
 from lerobot_memobench.jobs.processes import locked
-from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:

@@ -15,6 +15,15 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
+from lerobot_memobench.constants import (
+    ACTION_DIM,
+    EXECUTION,
+    PROMPT,
+    PROMPT_HORIZON,
+    SEALED,
+    SPLITS,
+    UNSEEDED,
+)
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.envs.episode_log import (
     EpisodeLog,
@@ -38,15 +47,6 @@ from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS,
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
-from lerobot_memobench.protocol import (
-    ACTION_DIM,
-    EXECUTION,
-    PROMPT,
-    PROMPT_HORIZON,
-    SEALED,
-    SPLITS,
-    UNSEEDED,
-)
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of, task_names
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory

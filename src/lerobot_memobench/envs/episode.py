@@ -13,12 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.envs.pacing import Pacing
-from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
-from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert, blind_routine
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     ACTION_DIM,
     CAMERAS,
     ENDED,
@@ -35,6 +30,11 @@ from lerobot_memobench.protocol import (
     UPSTREAM_EVALUATIONS,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.envs.pacing import Pacing
+from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
+from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
+from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
+from lerobot_memobench.experts.expert import Expert, blind_routine
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import (
     InvalidActionError,
@@ -367,7 +367,7 @@ class Episode:
 def referent_of(task: Task, seed: int, salt: str | None = None) -> Task:
     """Return the variant of a task that the seed draws.
 
-    Draws are balanced: from the first seed of a split (`protocol.SPLITS`), each block of as many seeds as variants
+    Draws are balanced: from the first seed of a split (`constants.SPLITS`), each block of as many seeds as variants
     contains every variant once, in random order. All variants are equally frequent and independent of the layout.
 
     Args:

@@ -1,6 +1,6 @@
 """The file of an evaluation, ``evaluation.json``: all facts that its episodes share.
 
-`lerobot eval` writes all of it (`run.card`). LeRobot's own commands and vla-evaluation-harness write protocol and
+`lerobot eval` writes all of it (`rollouts.card`). LeRobot's own commands and vla-evaluation-harness write protocol and
 policy only, when the first episode ends. Outcomes are in the log alone (`episode_log`).
 """
 
@@ -152,7 +152,7 @@ class Start(TypedDict):
 
 
 class CardSettings(TypedDict, total=False):
-    """Settings of an evaluation that its protocol does not hold, see `run.settings.EvaluationSettings`.
+    """Settings of an evaluation that its protocol does not hold, see `rollouts.settings.EvaluationSettings`.
 
     Attributes:
         env: other fields of `MemobenchEnvConfig`, such as tasks and videos.

@@ -23,6 +23,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
+from lerobot_memobench.constants import CLOCK, CONTROL_HZ
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, check_facts, facts_of
 from lerobot_memobench.envs.observations import (
@@ -36,7 +37,6 @@ from lerobot_memobench.envs.observations import (
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, INTACT, RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import CLOCK, CONTROL_HZ
 from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     group_of,

@@ -11,10 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, EnvSettings
-from lerobot_memobench.envs.video import annotate
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     ACTION_DIM,
     CONTROL_HZ,
     ENDED,
@@ -23,6 +20,9 @@ from lerobot_memobench.protocol import (
     PROMPT_HORIZON,
     PROPRIO_DIM,
 )
+from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, EnvSettings
+from lerobot_memobench.envs.video import annotate
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.convention import shown
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS, SIZE, SLOTS
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED

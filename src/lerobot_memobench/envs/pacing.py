@@ -16,8 +16,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.envs.settings import EnvSettings, steps_per_action
-from lerobot_memobench.protocol import LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.tasks.task import STRICT
 
 STEPS_BETWEEN_PAUSES = (20, 120)

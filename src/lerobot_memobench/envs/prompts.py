@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of, files_below
-from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
 from lerobot_memobench.tasks.task import Task
 from mujoco_raster.highlights import Highlight
@@ -134,7 +134,7 @@ def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
 def _code() -> tuple[str, ...]:
     """Return the sources, library versions and Python version that compute a prompt."""
     package = Path(__file__).parents[1]
-    digest = hashlib.sha256((package / "protocol.py").read_bytes())
+    digest = hashlib.sha256((package / "constants.py").read_bytes())
     for source in sorted(file for part in SOURCES for file in files_below(package / part, ".py")):
         digest.update(source.relative_to(package).as_posix().encode() + source.read_bytes())
     return digest.hexdigest(), *(metadata.version(name) for name in PACKAGES), sys.version

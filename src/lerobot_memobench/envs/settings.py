@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.protocol import (
+from lerobot_memobench.constants import (
     BY_PAPER,
     EVALUATION_SEED,
     HOLD_MEAN,
@@ -24,6 +23,7 @@ from lerobot_memobench.protocol import (
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
+from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
 from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
@@ -366,18 +366,14 @@ class EnvSettings:
     def protocol_block(self) -> dict[str, Any]:
         """Settings that must agree to join or compare two evaluations."""
         agreed = {name: value for name, value in asdict(self).items() if name not in NOT_COMPARED}
-        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **revision(self.suite, self.difficulty)}
+        strict = {HOLD: HOLD_MEAN, GOALS: STRICT_GOALS} if self.suite == STRICT else {}
+        return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **strict}
 
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
 SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
 """Settings with an effect on rollouts."""
-
-
-def revision(suite: str, difficulty: str) -> dict[str, int]:
-    """Return protocol entries of a suite that changed with versions: holds and goals of strict tasks."""
-    return {HOLD: HOLD_MEAN, GOALS: STRICT_GOALS} if suite == STRICT else {}
 
 
 def steps_per_action(speed: float) -> int:

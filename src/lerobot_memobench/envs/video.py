@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from lerobot_memobench.constants import CONTROL_HZ, PROMPT
 from lerobot_memobench.io import draft_of, explaining_disk_errors
-from lerobot_memobench.protocol import CONTROL_HZ, PROMPT
 
 if TYPE_CHECKING:
     from av import VideoFrame

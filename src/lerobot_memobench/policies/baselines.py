@@ -23,9 +23,9 @@ from lerobot.processor import (
 )
 from torch import Tensor, nn
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.envs.observations import SIMULATOR
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.protocol import ACTION_DIM
 
 
 @dataclass

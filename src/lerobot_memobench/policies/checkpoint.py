@@ -13,10 +13,10 @@ from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import LONGEST_NAME, Count, check_fetched, file_name, refusing
 from lerobot_memobench.io import read_json as read_json_file
-from lerobot_memobench.protocol import CLOCK
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
+from lerobot_memobench.constants import ENDED, NO_CLOCK
 from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.policies.checkpoint import statistics_shapes, trained_names, training_of
-from lerobot_memobench.protocol import ENDED, NO_CLOCK
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, WRIST, convention_of
 
 if TYPE_CHECKING:
@@ -245,7 +245,7 @@ def chosen_convention(
 # --- the clock of observations ---
 
 Clock = tuple[int, int]
-"""Phase and step of an observation (`lerobot_memobench.protocol`)."""
+"""Phase and step of an observation (`lerobot_memobench.constants`)."""
 
 
 def begins_episode(last: Clock | None, now: Clock) -> bool:

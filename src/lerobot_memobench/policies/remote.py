@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from lerobot_memobench.constants import ACTION_DIM, CAMERAS, EXECUTION
 from lerobot_memobench.envs.observations import PIXEL_INPUT, PRIVILEGED, SIMULATOR
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import short
@@ -36,7 +37,6 @@ from lerobot_memobench.policies.remote_connection import (
     Connection,
     NamedValues,
 )
-from lerobot_memobench.protocol import ACTION_DIM, CAMERAS, EXECUTION
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED, WRIST
 
 logger = logging.getLogger(__name__)

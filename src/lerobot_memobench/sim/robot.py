@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.protocol import CONTROL_HZ
+from lerobot_memobench.constants import CONTROL_HZ
 
 Array = NDArray[np.float64]
 

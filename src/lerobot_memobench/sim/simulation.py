@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.protocol import ACTION_DIM
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene

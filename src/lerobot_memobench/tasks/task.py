@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
+from lerobot_memobench.constants import HORIZON
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.protocol import HORIZON
 from lerobot_memobench.tasks.bddl import Region
 from lerobot_memobench.tasks.formula import Atom, Formula, rename
 

@@ -12,6 +12,21 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lerobot_memobench.commands.command_line import (
+    CONFIG_FILE,
+    HELP,
+    PATH,
+    RECIPE,
+    TRAINING_OPTIONS,
+    TYPE,
+    CommandSettings,
+    read_words,
+    resolve_recipe,
+    spelled,
+    value_of,
+    without,
+)
+from lerobot_memobench.commands.lerobot_commands import call_lerobot
 from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
@@ -39,21 +54,6 @@ from lerobot_memobench.policies.checkpoint import (
     text_of_link,
 )
 from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
-from lerobot_memobench.run.command_line import (
-    CONFIG_FILE,
-    HELP,
-    PATH,
-    RECIPE,
-    TRAINING_OPTIONS,
-    TYPE,
-    CommandSettings,
-    read_words,
-    resolve_recipe,
-    spelled,
-    value_of,
-    without,
-)
-from lerobot_memobench.run.lerobot_commands import call_lerobot
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
@@ -85,7 +85,7 @@ NOT_COMPARED = {
 
 
 def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
-    """Run ``lerobot train`` by the words of `run.command_line.parse_words`; return the exit status."""
+    """Run ``lerobot train`` by the words of `commands.command_line.parse_words`; return the exit status."""
     prompt_frames, obs_type, rest = take_training_options(resolve_recipe(with_last_checkpoint(words)))
     asked = read_words("train", rest)
     if HELP in words:
@@ -246,10 +246,11 @@ def check_with_lerobot(config: TrainPipelineConfig, asked: CommandSettings) -> N
         MemobenchError: LeRobot refuses it, or the folder of a new training exists.
     """
     if not config.resume and config.output_dir is not None and config.output_dir.is_dir():
-        raise MemobenchError(
-            f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training with "
-            "resume=true"
-        )
+        with locked_run(asked.get("output_dir")):  # a training that is running there is the better reason
+            raise MemobenchError(
+                f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training "
+                "with resume=true"
+            )
     given = {CONFIG_FILE: asked.config_path, "output_dir": asked.words.get("output_dir")} if config.resume else {}
     line, sys.argv = sys.argv, [sys.argv[0], *(f"--{key}={value}" for key, value in given.items() if value is not None)]
     try:

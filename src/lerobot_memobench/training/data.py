@@ -24,6 +24,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from lerobot_memobench.constants import OBS_PHASE
 from lerobot_memobench.datasets.episodes import STRANGER, list_episodes
 from lerobot_memobench.datasets.frames import (
     LEVEL_COLUMNS,
@@ -69,7 +70,6 @@ from lerobot_memobench.policies.memobench_mem.texts import (
     subgoals_of,
     texts_of,
 )
-from lerobot_memobench.protocol import OBS_PHASE
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.features import detected_slots, picture_features
 from lerobot_memobench.training.sampler import seed_of

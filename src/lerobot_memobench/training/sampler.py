@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_memobench.constants import PROMPT
 from lerobot_memobench.datasets.episodes import list_episodes
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import PROMPTED
-from lerobot_memobench.protocol import PROMPT
 
 
 class FrameSampler:

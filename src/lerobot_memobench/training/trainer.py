@@ -27,6 +27,8 @@ from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
 
+from lerobot_memobench.commands.command_line import register_plugins
+from lerobot_memobench.constants import CLOCK, IMAGE_SIZE
 from lerobot_memobench.datasets.frames import SamplesInMemory
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.observations import chooses_inputs
@@ -34,8 +36,6 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import lock_refusal
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
-from lerobot_memobench.protocol import CLOCK, IMAGE_SIZE
-from lerobot_memobench.run.command_line import register_plugins
 from lerobot_memobench.training.data import check_environment, complete_statistics, open_metadata, with_features
 from lerobot_memobench.training.features import cameras_of
 from lerobot_memobench.training.view import (

@@ -27,6 +27,7 @@ from lerobot.configs import FeatureType
 from lerobot.utils.constants import OBS_IMAGES
 from PIL import Image, ImageOps
 
+from lerobot_memobench.constants import CAMERAS, CLOCK
 from lerobot_memobench.datasets.demonstration import LEVEL_COLUMNS
 from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
 from lerobot_memobench.datasets.frames import FrameTable, read_frame_table
@@ -46,7 +47,6 @@ from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
-from lerobot_memobench.protocol import CAMERAS, CLOCK
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
 from lerobot_memobench.training.features import cameras_of
 

@@ -16,6 +16,7 @@ from torch import nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from lerobot_memobench.constants import CAMERAS, CLOCK, IMAGE_SIZE
 from lerobot_memobench.datasets.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
@@ -33,7 +34,6 @@ from lerobot_memobench.policies.memobench_mem.memory import (
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING, REGRESSION, SIZES, Dimensions
-from lerobot_memobench.protocol import CAMERAS, CLOCK, IMAGE_SIZE
 
 logger = logging.getLogger(__name__)
 

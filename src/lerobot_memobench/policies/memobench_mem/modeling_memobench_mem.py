@@ -20,6 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_ATTENTIO
 from torch import Tensor, nn
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.constants import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
@@ -64,7 +65,6 @@ from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE
 from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory, Rollout
 from lerobot_memobench.policies.memobench_mem.sizes import REGRESSION
 from lerobot_memobench.policies.memory_reads import Chunk, chunk_reads
-from lerobot_memobench.protocol import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 
 # Importing the processor registers the steps of saved pipelines, which are built after the policy.
 from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # noqa: F401  # isort: skip
@@ -262,7 +262,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         ``noise``: normal noise with the standard deviation of its values is added to it.
         """
         memory, envs = self.model.memory, self.rollout.envs
-        assert memory is not None  # `run.plan` refuses others
+        assert memory is not None  # `rollouts.plan` refuses others
 
         def noised(row: int) -> Any:
             return memory.noised(envs[row].memory, torch.Generator().manual_seed(envs[row].seed))

@@ -16,6 +16,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES
 from torch import Tensor, nn
 from torch.nn.functional import pad, rms_norm
 
+from lerobot_memobench.constants import CAMERAS, OBS_PHASE
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector
 from lerobot_memobench.perception.objects import ObjectLocalizer, upright
@@ -29,7 +30,6 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     fingerprint,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, OBJECT_TOKENS
-from lerobot_memobench.protocol import CAMERAS, OBS_PHASE
 from lerobot_memobench.sim.asset import AGENTVIEW_POSITION, TABLE_TOP
 from lerobot_memobench.sim.object_layout import FIELDS, SIZE, SLOTS, WIDTH, field
 from lerobot_memobench.sim.object_slots import classes

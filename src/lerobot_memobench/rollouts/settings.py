@@ -11,11 +11,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.eval import EvalPipelineConfig
 
-from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-from lerobot_memobench.envs.settings import SETTINGS, EnvSettings
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import portable_path
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     TYPE,
     build,
     chosen_class,
@@ -24,6 +20,10 @@ from lerobot_memobench.run.command_line import (
     read_words,
     value_of,
 )
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
+from lerobot_memobench.envs.settings import SETTINGS, EnvSettings
+from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.policies.checkpoint import portable_path
 from lerobot_memobench.tasks.catalogue import lerobots_choice
 from lerobot_memobench.tasks.task import PUBLISHED
 
@@ -108,9 +108,9 @@ def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
     Raises:
         MemobenchError: an unknown key or value, named with the nearest known one.
     """
-    asked = typed_settings(read_words("eval", words).settings)
-    chosen = chosen_class(PreTrainedConfig, "policy", with_policy(asked).policy)
-    return replace(asked, policy={**asked.policy, **given_values(chosen, asked.policy, "policy.")})
+    settings = typed_settings(read_words("eval", words).settings)
+    chosen = chosen_class(PreTrainedConfig, "policy", with_policy(settings).policy)
+    return replace(settings, policy={**settings.policy, **given_values(chosen, settings.policy, "policy.")})
 
 
 def typed_settings(given: Mapping[str, Any]) -> EvaluationSettings:
@@ -163,19 +163,19 @@ def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in env.items() if name not in names} | {"suite": suites[0], "tasks": tasks}
 
 
-def with_policy(asked: EvaluationSettings) -> EvaluationSettings:
+def with_policy(settings: EvaluationSettings) -> EvaluationSettings:
     """Return settings that evaluate the scripted expert where no policy is named."""
-    if {"type", "path"} & asked.policy.keys():
-        return asked
-    return replace(asked, policy={**asked.policy, "type": EXPERT})
+    if {"type", "path"} & settings.policy.keys():
+        return settings
+    return replace(settings, policy={**settings.policy, "type": EXPERT})
 
 
-def policy_of(asked: EvaluationSettings) -> PreTrainedConfig:
+def policy_of(settings: EvaluationSettings) -> PreTrainedConfig:
     """Return the configuration of the policy; that of a repository is downloaded.
 
     Raises:
         MemobenchError: the type is not known, or a value cannot be read. Others are the configuration's own.
     """
-    found: PreTrainedConfig = build(PreTrainedConfig, asked.policy, "policy")
+    found: PreTrainedConfig = build(PreTrainedConfig, settings.policy, "policy")
     found.pretrained_path = None  # it does not depend on the place of the checkpoint
     return found

@@ -12,15 +12,15 @@ from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.lerobot import main
+from lerobot_memobench.commands.command_line import parse_words, read_words, recipe_file, recipes, value_of
+from lerobot_memobench.commands.lerobot_commands import lerobot_commands
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.command_line import parse_words, read_words, recipe_file, recipes, value_of
-from lerobot_memobench.run.lerobot_commands import lerobot_commands
 
 
 @pytest.fixture(autouse=True)
 def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.commands.command_line.register_plugins", lambda: None)
 
 
 def values(command: str, *words: str) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from lerobot_memobench.policies.checkpoint import (
     portable_path,
 )
 from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, identity_of, tree_hash
-from lerobot_memobench.run.plan import EvaluationPlan
+from lerobot_memobench.rollouts.plan import EvaluationPlan
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
 

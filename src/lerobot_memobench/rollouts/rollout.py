@@ -20,8 +20,8 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 from numpy.typing import NDArray
 
+from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.envs.settings import INTACT
-from lerobot_memobench.protocol import CLOCK
 
 PIXELS, PHASE, STEP = "pixels", "phase", "step"
 """Keys of the environment's observations; ``phase`` is 0 in the demonstration prompt and 1 in the execution."""
@@ -118,10 +118,11 @@ class Actor:
 
     def act(self, inputs: dict[str, Any]) -> NDArray[np.float32]:
         """Return the environment's actions (B, A)."""
-        policys, environments = self.after
-        action = environments({ACTION: policys(self.actions.select(inputs))})[ACTION]
-        found: NDArray[np.float32] = action.to("cpu").numpy()
-        return found
+        policy_post, env_post = self.after
+        actions: NDArray[np.float32] = (
+            env_post({ACTION: policy_post(self.actions.select(inputs))})[ACTION].cpu().numpy()
+        )
+        return actions
 
 
 def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = None, corrupt: str = INTACT) -> None:

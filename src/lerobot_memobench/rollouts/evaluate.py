@@ -1,36 +1,53 @@
-"""Run an evaluation in this process: all of it, a part, or the episodes that an earlier run left."""
+"""Run an evaluation in this process, batch after batch: all of it, a part, or the episodes that an earlier run left."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
+from copy import copy
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.utils.device_utils import get_safe_torch_device
+from lerobot.utils.random_utils import set_seed
 
 from lerobot_memobench.envs.episode_log import Key, has_log, key_of, read_lines
 from lerobot_memobench.envs.evaluation_file import (
     EVALUATION_FILE,
+    INPUTS,
     POLICY,
+    Acting,
     differences_of_parts,
     read_evaluation,
     write_evaluation,
 )
+from lerobot_memobench.envs.lerobot import Opener
+from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import count_of, refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path
-from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import card_of, extended, with_checkpoint
-from lerobot_memobench.run.evaluate import Advance, evaluate
-from lerobot_memobench.run.plan import Cell, EvaluationPlan, Shard
+from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.memory_reads import MEMORY_READS, noting_reads
+from lerobot_memobench.rollouts.card import card_of, extended, with_checkpoint
+from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, PlannedTask, Shard
+from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, roll
 
 VIDEOS = "videos"
 """Folder of the videos, in that of the log."""
 
 Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
+
+Advance = Callable[[int, int, str], None]
+"""Called after each batch with the finished episodes, all episodes of the run, and the task's name."""
 
 
 def run_evaluation(
@@ -41,14 +58,14 @@ def run_evaluation(
     Args:
         note: called with notes, and with the command that resumes a run that breaks off.
         begin: called with a line on the evaluation before it starts.
-        advance: see `evaluate.Advance`.
+        advance: see `Advance`.
 
     Raises:
         MemobenchError: the folder holds another evaluation, or weights are missing. Any error of LeRobot.
     """
     if plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
-    with held(plan):
+    with locked_evaluation(plan):
         card = card_of(plan)
         if plan.options.resume:
             card = resumed_card(plan.log, card, note)
@@ -91,6 +108,97 @@ def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note
                 f"the episodes that ended are in {plan.log}; report them: `memobench report {plan.log}`; "
                 f"resume: `{plan.resuming_command}`"
             )
+
+
+# --- the loop ---
+
+
+def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Advance) -> None:
+    """Run batches of episodes; the environments write the log.
+
+    Args:
+        cells: the batches, those of one task in succession.
+        begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
+
+    Raises:
+        MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
+    """
+    policy: Any = plan.policy
+    device = get_safe_torch_device(policy.device)
+    torch.backends.cudnn.benchmark = True
+    torch.backends.cuda.matmul.allow_tf32 = True
+    set_seed(plan.seed)
+    actor = load_actor(plan)
+    limit_torch(sum(parameter.numel() for parameter in actor.policy.parameters()))
+    begin()
+    # Logged rows of a resumed batch rest, and have no memory to swap.
+    rests = plan.environment.corrupt != SWAP
+    environment = replace(plan.environment, resume=rests and has_log(plan.log))
+    facts = read_evaluation(plan.log)
+    by = Acting(facts[POLICY], facts["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
+    # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
+    opened = environment.opener(actor.policy.config, by, plan.log)
+    environments = Environments(opened, plan.settings.use_async_envs is not False)
+    seeds = BatchSeeds(actor.policy, plan.seed)
+    scenes = environment.settings
+    reads = partial(noting_reads, plan.log, scenes) if plan.options.memory_reads else None
+    amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
+    done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
+    with amp, closing(environments):
+        for task, number in cells:
+            runs = plan.grid.runs_of(number)
+            batch = range(plan.seed + runs.start, plan.seed + runs.stop)
+            env = environments.of(task, len(batch))
+            seeds.begin(task.name, batch.start)
+            with nullcontext() if reads is None else reads(task.name, actor.policy, batch) as ended:
+                roll(env, actor, batch, ended, scenes.corrupt)
+            done += len(batch)
+            advance(done, total, task.name)
+
+
+class Environments:
+    """The vector environment of one task and batch size at a time.
+
+    Args:
+        opened: makes one. use_async: gives each row a process of its own.
+    """
+
+    def __init__(self, opened: Opener, use_async: bool) -> None:
+        self._opened, self._use_async = opened, use_async
+        self._key: tuple[PlannedTask, int] | None = None
+        self._env: Any = None
+
+    def of(self, task: PlannedTask, rows: int) -> Any:
+        """Return the environment of a task with a number of rows, after closing any other."""
+        if self._key != (task, rows):
+            self.close()
+            self._env, self._key = self._opened(task.folder, rows, self._use_async), (task, rows)
+        return self._env
+
+    def close(self) -> None:
+        """Close the environment that is open."""
+        if self._env is not None:
+            self._env.close()
+        self._env = self._key = None
+
+
+def load_actor(plan: EvaluationPlan) -> Actor:
+    """Return the plan's policy and its processors, as LeRobot makes them."""
+    policy, environment = copy(plan.policy), plan.environment
+    policy.pretrained_path = None if plan.policy_path is None else Path(plan.policy_path)
+    renamed = dict(plan.settings.rename_map)
+    with quiet() if plan.policy_path is None else nullcontext():  # LeRobot warns that there are no weights
+        loaded = make_policy(cfg=policy, env_cfg=environment, rename_map=renamed).eval()
+    before, after = make_pre_post_processors(
+        policy_cfg=policy,
+        pretrained_path=policy.pretrained_path,
+        preprocessor_overrides={
+            "device_processor": {"device": str(loaded.config.device)},
+            "rename_observations_processor": {"rename_map": renamed},
+        },
+    )
+    env_before, env_after = environment.get_env_processors()  # LeRobot's function would give any XVLA those of LIBERO
+    return Actor(loaded, (env_before, before), (after, env_after))
 
 
 # --- resuming: whether it is the same evaluation, and which episodes are left ---
@@ -165,8 +273,8 @@ def check_folder(folder: Path) -> None:
 
 
 @contextmanager
-def held(plan: EvaluationPlan) -> Iterator[None]:
-    """Make and lock the folders of an evaluation and of its log, see `made`.
+def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
+    """Make and lock the folders of an evaluation and of its log, see `locked_folder`.
 
     Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file.
 
@@ -175,7 +283,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():
-            stack.enter_context(made(folder))
+            stack.enter_context(locked_folder(folder))
         refuse_links(plan.log / VIDEOS, plan.log / MEMORY_READS)
         for folder in (plan.log, plan.log / VIDEOS, plan.log / MEMORY_READS):
             remove_drafts(folder)
@@ -189,7 +297,7 @@ def held(plan: EvaluationPlan) -> Iterator[None]:
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
+def locked_folder(folder: Path) -> Iterator[None]:
     """Make a folder and lock it while it is written to; afterwards new folders that are empty are removed.
 
     Raises:

@@ -15,15 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
-from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
-from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
-from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
-from lerobot_memobench.policies.compatibility import check_features, chosen_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
-from lerobot_memobench.protocol import (
+from lerobot_memobench.commands.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
+from lerobot_memobench.constants import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
     EVIDENCE_EPISODES,
@@ -32,7 +25,14 @@ from lerobot_memobench.protocol import (
     SPLITS,
     VALIDATION,
 )
-from lerobot_memobench.run.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
+from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
+from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
+from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
+from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
+from lerobot_memobench.policies.compatibility import check_features, chosen_convention
+from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.libero_suites import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-    from lerobot_memobench.run.settings import EvaluationSettings
+    from lerobot_memobench.rollouts.settings import EvaluationSettings
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
 """Policies whose actions the environment offers -> the setting by which it does."""
@@ -97,7 +97,7 @@ class EvaluationPlan:
 
     @property
     def split(self) -> str | None:
-        """The split of `protocol.SPLITS` that holds the seeds of all its scenes, None without one."""
+        """The split of `constants.SPLITS` that holds the seeds of all its scenes, None without one."""
         seeds = self.seeds
         return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
 
@@ -141,41 +141,41 @@ def plan_line(line: Sequence[str]) -> EvaluationPlan:
 
 def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation for the words of a command line."""
-    from lerobot_memobench.run.settings import read_settings
+    from lerobot_memobench.rollouts.settings import read_settings
 
-    options, settings = take_run_options(words)
-    return make_plan(read_settings(settings), options, ("lerobot", "eval", *spelled(words)))
+    options, others = take_run_options(words)
+    return make_plan(read_settings(others), options, ("lerobot", "eval", *spelled(words)))
 
 
-def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
+def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
     """Complete the settings of the benchmark's evaluation and check them.
 
     Raises:
         MemobenchError: it cannot be run.
     """
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-    from lerobot_memobench.run.settings import policy_of, with_policy
+    from lerobot_memobench.rollouts.settings import policy_of, with_policy
     from lerobot_memobench.sim.files import check_assets
 
-    if options.resume and asked.output_dir is None:
+    if options.resume and settings.output_dir is None:
         raise MemobenchError("resume=true needs the folder of the evaluation to resume: output_dir=<folder>")
     if options.split is not None:
         check_choice("split", options.split, EVALUATED)
-    asked = with_device(with_policy(asked), options)
-    policy = policy_of(asked)
-    check_expert(policy, asked.env.get("suite", PUBLISHED))
-    named = asked.env.get("convention") or (MIRRORED if asked.env.get("camera_name_mapping") else None)
-    convention = chosen_convention(asked.policy_path, policy, named, asked.rename_map)
-    asked = asked if convention is None else replace(asked, env={**asked.env, "convention": convention})
-    output = _output(asked, options, policy)
-    log = Path(asked.env.get("log_dir") or output)
-    asked = with_salt(with_batch_size(with_protocol(asked, options, policy), options, log, policy), options, log)
-    environment = MemobenchEnvConfig(**{**asked.env, "log_dir": None, "resume": False})
+    settings = with_device(with_policy(settings), options)
+    policy = policy_of(settings)
+    check_expert(policy, settings.env.get("suite", PUBLISHED))
+    named = settings.env.get("convention") or (MIRRORED if settings.env.get("camera_name_mapping") else None)
+    convention = chosen_convention(settings.policy_path, policy, named, settings.rename_map)
+    settings = settings if convention is None else replace(settings, env={**settings.env, "convention": convention})
+    output = _output(settings, options, policy)
+    log = Path(settings.env.get("log_dir") or output)
+    settings = with_salt(with_batch_size(with_protocol(settings, options, policy), options, log, policy), options, log)
+    environment = MemobenchEnvConfig(**{**settings.env, "log_dir": None, "resume": False})
     for name, value in vars(environment.settings_for(policy)).items():
         setattr(environment, name, value)
-    asked = with_names(replace(asked, env={**asked.env, **environment.gym_kwargs}), environment)
-    grid = make_grid(asked, environment)
-    plan = EvaluationPlan(asked, policy, environment, grid, output, log, options, tuple(command))
+    settings = with_names(replace(settings, env={**settings.env, **environment.gym_kwargs}), environment)
+    grid = make_grid(settings, environment)
+    plan = EvaluationPlan(settings, policy, environment, grid, output, log, options, tuple(command))
     check_policy_fits(plan)
     check_corruption(plan)
     check_split(plan)
@@ -184,23 +184,23 @@ def make_plan(asked: EvaluationSettings, options: RunOptions, command: Sequence[
     return plan
 
 
-def make_grid(asked: EvaluationSettings, environment: MemobenchEnvConfig) -> Grid:
+def make_grid(settings: EvaluationSettings, environment: MemobenchEnvConfig) -> Grid:
     """Return the episodes of an evaluation.
 
     Raises:
         MemobenchError: unknown tasks, or no episodes.
     """
     tasks = tuple(PlannedTask(*chosen) for chosen in environment.selected())
-    runs, seed = asked.episodes, asked.seed
+    runs, seed = settings.episodes, settings.seed
     if runs is None or seed is None or runs < 1:
         raise MemobenchError(f"found episodes={runs} and seed={seed}; expected whole numbers, and at least one episode")
-    return Grid(tasks, runs, min(asked.batch_size or 1, runs), seed - environment.seed_base)
+    return Grid(tasks, runs, min(settings.batch_size or 1, runs), seed - environment.seed_base)
 
 
-def _output(asked: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:
+def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:
     """Return the folder of the evaluation or of its part; by default a new dated folder."""
-    if asked.output_dir is not None:
-        return Path(asked.output_dir) / (options.shard.folder if options.shard is not None else "")
+    if settings.output_dir is not None:
+        return Path(settings.output_dir) / (options.shard.folder if options.shard is not None else "")
     base = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_memobench_{policy.type}"
     others = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
     return next(folder for folder in itertools.chain([base], others) if not folder.exists())
@@ -267,21 +267,21 @@ def check_split(plan: EvaluationPlan) -> None:
     Raises:
         MemobenchError: they are refused.
     """
-    asked, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
-    if plan.environment.suite in LIBERO_SUITES and asked not in (None, PAPER):
+    split, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
+    if plan.environment.suite in LIBERO_SUITES and split not in (None, PAPER):
         raise MemobenchError(
-            f"split={asked} is of memory tasks; tasks of {plan.environment.suite} have {NUM_STATES} initial states, of "
+            f"split={split} is of memory tasks; tasks of {plan.environment.suite} have {NUM_STATES} initial states, of "
             "which episode i has the i-th: leave split= out"
         )
-    if asked is not None and plan.split != asked:
-        split = SPLITS[asked]
+    if split is not None and plan.split != split:
+        known = SPLITS[split]
         raise MemobenchError(
-            f"split={asked} has the seeds {split[0]} to {split[-1]}, and {seeds[0]} to {seeds[-1]} were asked for; "
-            f"leave seed= out, and ask for at most {len(split)} episodes"
+            f"split={split} has the seeds {known[0]} to {known[-1]}, and {seeds[0]} to {seeds[-1]} were asked for; "
+            f"leave seed= out, and ask for at most {len(known)} episodes"
         )
-    if plan.environment.salt and asked != SEALED:
+    if plan.environment.salt and split != SEALED:
         raise MemobenchError("found salt=, which is of the sealed test; leave it out, or run `memobench test-sealed`")
-    if asked is None and seeds[0] <= sealed[-1] and seeds[-1] >= sealed[0]:
+    if split is None and seeds[0] <= sealed[-1] and seeds[-1] >= sealed[0]:
         raise MemobenchError(
             f"found seeds {seeds[0]} to {seeds[-1]}; {sealed[0]} to {sealed[-1]} are sealed: run them once per release "
             "by `memobench test-sealed policy=…`, and choose settings by split=validation"
@@ -324,7 +324,7 @@ def check_scenes(plan: EvaluationPlan) -> None:
 # --- the benchmark's defaults ---
 
 
-def with_device(asked: EvaluationSettings, options: RunOptions) -> EvaluationSettings:
+def with_device(settings: EvaluationSettings, options: RunOptions) -> EvaluationSettings:
     """Return settings with the CPU as the policy's device where the machine has no other.
 
     Parts decide on their own machine: this machine may be a login node.
@@ -335,58 +335,59 @@ def with_device(asked: EvaluationSettings, options: RunOptions) -> EvaluationSet
     import torch
 
     if not options.shards:
-        check_device(asked.policy.get("device"))
-    if options.shards or "device" in asked.policy or torch.cuda.is_available() or torch.backends.mps.is_available():
-        return asked
-    return replace(asked, policy={**asked.policy, "device": "cpu"})
+        check_device(settings.policy.get("device"))
+    if options.shards or "device" in settings.policy or torch.cuda.is_available() or torch.backends.mps.is_available():
+        return settings
+    return replace(settings, policy={**settings.policy, "device": "cpu"})
 
 
-def with_protocol(asked: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> EvaluationSettings:
+def with_protocol(settings: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> EvaluationSettings:
     """Return settings with the protocol's seed and episodes, the policy's inputs, and videos."""
-    if asked.seed is None:
+    if settings.seed is None:
         seed = EVALUATION_SEED if options.split is None else SPLITS[options.split].start
-        asked = replace(asked, seed=seed)
-    if asked.episodes is None:
-        asked = replace(asked, episodes=EVIDENCE_EPISODES if asked.env.get("evidence") else EVALUATION_EPISODES)
-    asked = asked.env_default(seed_base=asked.seed)  # episodes are counted from the first
-    if (observed := obs_type_of(policy)) not in (None, PIXELS) and asked.env.get("suite") not in LIBERO_SUITES:
-        asked = asked.env_default(obs_type=observed)
+        settings = replace(settings, seed=seed)
+    if settings.episodes is None:
+        episodes = EVIDENCE_EPISODES if settings.env.get("evidence") else EVALUATION_EPISODES
+        settings = replace(settings, episodes=episodes)
+    settings = settings.env_default(seed_base=settings.seed)  # episodes are counted from the first
+    if (observed := obs_type_of(policy)) not in (None, PIXELS) and settings.env.get("suite") not in LIBERO_SUITES:
+        settings = settings.env_default(obs_type=observed)
     if policy.type in SCRIPTED:
-        asked = asked.env_default(**{SCRIPTED[policy.type]: True})
-    return asked.env_default(videos=0 if asked.env.get("obs_type") == OBJECTS else VIDEO_EPISODES)
+        settings = settings.env_default(**{SCRIPTED[policy.type]: True})
+    return settings.env_default(videos=0 if settings.env.get("obs_type") == OBJECTS else VIDEO_EPISODES)
 
 
-def with_names(asked: EvaluationSettings, environment: MemobenchEnvConfig) -> EvaluationSettings:
+def with_names(settings: EvaluationSettings, environment: MemobenchEnvConfig) -> EvaluationSettings:
     """Return settings with the ``rename_map`` of the policy's training, as far as the environment has its names."""
-    if asked.policy_path is None or asked.rename_map:
-        return asked
+    if settings.policy_path is None or settings.rename_map:
+        return settings
     observed = environment.features_map.values()
-    names = {old: new for old, new in trained_names(asked.policy_path).items() if old in observed}
-    return replace(asked, rename_map=names)
+    names = {old: new for old, new in trained_names(settings.policy_path).items() if old in observed}
+    return replace(settings, rename_map=names)
 
 
-def with_salt(asked: EvaluationSettings, options: RunOptions, log: Path) -> EvaluationSettings:
+def with_salt(settings: EvaluationSettings, options: RunOptions, log: Path) -> EvaluationSettings:
     """Return settings with a random salt for a sealed evaluation; a resumed one, or a part of it, keeps its salt.
 
     Raises:
         MemobenchError: a part that was started by itself has no salt; it would differ from that of the other parts.
     """
-    if options.split != SEALED or "salt" in asked.env:
-        return asked
+    if options.split != SEALED or "salt" in settings.env:
+        return settings
     if options.resume:
         for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
             if has_evaluation(folder):
-                return asked.env_default(salt=read_evaluation(folder)["protocol"].get("salt"))
+                return settings.env_default(salt=read_evaluation(folder)["protocol"].get("salt"))
     if options.shard is not None:
         raise MemobenchError(
             f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
             "part the same 32 random hexadecimal digits as salt="
         )
-    return asked.env_default(salt=secrets.token_hex(16))
+    return settings.env_default(salt=secrets.token_hex(16))
 
 
 def with_batch_size(
-    asked: EvaluationSettings, options: RunOptions, log: Path, policy: PreTrainedConfig
+    settings: EvaluationSettings, options: RunOptions, log: Path, policy: PreTrainedConfig
 ) -> EvaluationSettings:
     """Return settings with the number of environments that run at once.
 
@@ -394,24 +395,24 @@ def with_batch_size(
     suit the cores and divide the episodes. A resumed run keeps its number, because a policy's samples may depend on it.
     Parts run one environment each: by cores, each machine would divide the evaluation differently.
     """
-    given, episodes = asked.batch_size or 0, asked.episodes or 1
+    given, episodes = settings.batch_size or 0, settings.episodes or 1
     if given < 0:
         raise MemobenchError(
             f"found batch_size={given}; expected at least 1 environment at once, or 0 to choose by the machine"
         )
     if given:
-        return asked
+        return settings
     if options.resume and (earlier := earlier_batch_size(log)) is not None:
-        return replace(asked, batch_size=earlier)
-    if options.in_parts and asked.batch_size is None:
-        return replace(asked, batch_size=1)
+        return replace(settings, batch_size=earlier)
+    if options.in_parts and settings.batch_size is None:
+        return replace(settings, batch_size=1)
     # A policy may serve few environments at once, such as one for each of its servers.
     most = min(episodes, getattr(policy, "max_environments", None) or LARGEST_BATCH)
     learned = policy.type not in SCRIPTED and policy.device == "cpu"
-    if learned and asked.env.get("obs_type") == OBJECTS and not asked.use_async_envs:
-        return replace(asked, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
+    if learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs:
+        return replace(settings, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
     limit = max(1, min(int(cores() * 0.7), most))
-    return replace(asked, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
+    return replace(settings, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
 def earlier_batch_size(log: Path) -> int | None:

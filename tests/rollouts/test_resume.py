@@ -17,7 +17,7 @@ from safetensors.numpy import save_file
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.episode_log import EpisodeLog
-from lerobot_memobench.run import shards
+from lerobot_memobench.rollouts import shards
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, Killed, content, make_checkpoint, results
 
 COMMAND = ["eval", "env=memobench", f"tasks={STOVE},{DRAWER}", "episodes=4", "batch_size=2"]
@@ -187,7 +187,7 @@ def test_parts_have_whole_batches_on_any_machine(
     assert not Path("none").exists()
     words = [word for word in COMMAND if not word.startswith("batch_size")]
     for cores in (2, 64):
-        monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda cores=cores: cores)
+        monkeypatch.setattr("lerobot_memobench.rollouts.plan.cores", lambda cores=cores: cores)
         assert main([*words, f"output_dir=out{cores}", "shard=2/3"]) == 0
     assert results("out2/shard-2-of-3") == results("out64/shard-2-of-3")
     assert json.loads(Path("out2/shard-2-of-3/evaluation.json").read_text())["shard"] == "2/3"
@@ -214,7 +214,7 @@ def test_a_full_disk_is_named_with_folder_and_command(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a write raises it, without a path
 
     with monkeypatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.run.write_report", full)
+        patch.setattr("lerobot_memobench.rollouts.evaluate.write_report", full)
         assert evaluate("output_dir=out") == 2
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert "out cannot be written (No space left on device; " in last

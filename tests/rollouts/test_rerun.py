@@ -20,17 +20,17 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
-from lerobot_memobench.run import rerun
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.rerun import (
+from lerobot_memobench.rollouts import rerun
+from lerobot_memobench.rollouts.card import card_of
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
     differences_here,
-    plan_of_card,
-    repeatable_card,
+    plan_of,
+    read_repeatable,
 )
-from lerobot_memobench.run.settings import EvaluationSettings, settings_of
+from lerobot_memobench.rollouts.settings import EvaluationSettings, settings_of
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
@@ -43,7 +43,7 @@ RECORD = {"task": STOVE, "memory_type": "temporal", "episode": 0, "seed": 7, "su
 def in_folder(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """An empty folder, and no search of all installed packages."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
+        patch.setattr("lerobot_memobench.commands.command_line.register_plugins", lambda: None)
         patch.chdir(tmp_path_factory.mktemp("here"))
         make_checkpoint(Path("checkpoint"))
         yield
@@ -118,13 +118,13 @@ HOSTILE: list[tuple[str, dict[str, Any]]] = [
 def test_hostile_settings_are_refused_by_name(named: str, changes: dict[str, Any]) -> None:
     write_evaluation(Path(), card({**RANDOM, **changes}))
     with pytest.raises(MemobenchError, match=named.replace(".", r"\.")) as caught:
-        repeatable_card(Path("evaluation.json"))
+        read_repeatable(Path("evaluation.json"))
     assert "\n" not in str(caught.value)
 
 
 def test_the_device_of_a_card_may_be_missing_here(monkeypatch: pytest.MonkeyPatch) -> None:
     for there in (True, False):
-        monkeypatch.setattr("lerobot_memobench.run.rerun.has_device", lambda device, there=there: there)
+        monkeypatch.setattr("lerobot_memobench.rollouts.rerun.has_device", lambda device, there=there: there)
         asked = allowed(env={"tasks": STOVE}, policy={"type": "memobench_random", "device": "cuda"})
         assert ("device" in asked.policy) == there
 
@@ -144,7 +144,7 @@ def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.Monke
     facts = {"sha256": tree_hash(checkpoint_files(Path("checkpoint")))}
     seeing = {"settings": {"perception": "objects", "detector": "package"}, "detector_sha256": file_hash(SHIPPED)}
     for known in (facts, facts | seeing):
-        check_policy({"asked": asked, "policy": known})
+        check_policy({"policy": known}, asked.policy_path)
     for other, named in (
         ({}, "checkpoint"),
         (facts | {"sha256": "0" * 64}, "checkpoint"),
@@ -152,7 +152,7 @@ def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.Monke
         (facts | {"settings": seeing["settings"]}, "detector package"),
     ):
         with pytest.raises(MemobenchError, match=named):
-            check_policy({"asked": asked, "policy": other})
+            check_policy({"policy": other}, asked.policy_path)
 
 
 @pytest.mark.parametrize(
@@ -181,8 +181,8 @@ def test_a_strict_card_may_be_held_as_long_as_the_protocol_says(difficulty: str)
 @pytest.mark.parametrize("hold", [0, 1200])
 def test_a_strict_card_of_another_version_is_refused(hold: int) -> None:
     asked = {"tasks": [COUNTING], "episodes": 1, "suite": "strict", "hold": hold}
-    write_evaluation(Path(), card(RANDOM, protocol=asked))
-    with pytest.raises(MemobenchError, match=f"hold={hold} on the card"):
+    write_evaluation(Path(), card({**RANDOM, "env": {"tasks": COUNTING}}, protocol=asked))
+    with pytest.raises(MemobenchError, match=f"another version .*hold: {hold} and"):
         rerun.repeat(Path(), None, None, lambda plan: pytest.fail("it was run"), print)
 
 
@@ -299,7 +299,7 @@ def command_lines(draw: st.DrawFn) -> list[str]:
 def test_a_card_makes_its_plan_again(line: list[str]) -> None:
     plan = plan_line([*line, "output_dir=out"])
     write_evaluation(Path(), card_of(plan))
-    again = plan_of_card(repeatable_card(Path()), Path("out"))
+    again = plan_of(*read_repeatable(Path()), Path("out"))
     assert again.settings.portable == plan.settings.portable
     assert (again.options, again.policy, again.environment) == (plan.options, plan.policy, plan.environment)
     assert (again.seed, again.batch, again.grid) == (plan.seed, plan.batch, plan.grid)

@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.commands.command_line import parse_words
+from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
-from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.run.card import card_of, run_facts
-from lerobot_memobench.run.command_line import parse_words
-from lerobot_memobench.run.plan import (
+from lerobot_memobench.rollouts.card import card_of, run_facts
+from lerobot_memobench.rollouts.plan import (
     EvaluationPlan,
     Grid,
     PlannedTask,
@@ -30,7 +30,7 @@ from lerobot_memobench.run.plan import (
     plan_line,
     take_run_options,
 )
-from lerobot_memobench.run.settings import settings_of
+from lerobot_memobench.rollouts.settings import settings_of
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 from tests.support.logs import card
@@ -43,7 +43,7 @@ OBJECTS = "environment_state_agent_pos"
 @pytest.fixture(autouse=True)
 def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("lerobot_memobench.run.command_line.register_plugins", lambda: None)
+    monkeypatch.setattr("lerobot_memobench.commands.command_line.register_plugins", lambda: None)
 
 
 def test_a_plan_is_complete_and_never_changes() -> None:
@@ -106,7 +106,7 @@ PLANNED: list[tuple[list[str], dict[str, Any]]] = [
 def test_settings_are_typed_and_completed(
     words: list[str], found: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lerobot_memobench.run.plan.cores", lambda: 16)
+    monkeypatch.setattr("lerobot_memobench.rollouts.plan.cores", lambda: 16)
     plan = plan_line([*BARE, *words])
     assert {name: facts(plan)[name] for name in found} == found
     # The settings on a card make the same plan again.

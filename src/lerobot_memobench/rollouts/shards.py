@@ -33,17 +33,17 @@ from lerobot_memobench.jobs.processes import ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
-from lerobot_memobench.run.card import card_of, extended
-from lerobot_memobench.run.plan import EvaluationPlan, Shard, with_changes
-from lerobot_memobench.run.run import (
+from lerobot_memobench.rollouts.card import card_of, extended
+from lerobot_memobench.rollouts.evaluate import (
     VIDEOS,
     Note,
     check_folder,
     check_new,
+    locked_folder,
     logged,
-    made,
     resumed_card,
 )
+from lerobot_memobench.rollouts.plan import EvaluationPlan, Shard, with_changes
 
 LOGS = "logs"
 
@@ -177,7 +177,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
 def run_shards(plan: EvaluationPlan, jobs: Sequence[ShardJob], progress: ProgressCallback) -> Run:
     """Run all parts, at once or some at a time, and merge them."""
     out = plan.output.absolute()
-    with made(out):
+    with locked_folder(out):
         run_jobs(jobs, workers=plan.options.workers or len(jobs), progress=progress)
         return _merge_and_report(out, [job.folder for job in jobs if has_log(job.folder)])
 
@@ -196,7 +196,7 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
     Raises:
         MemobenchError: see `merge`; or another run writes to ``out``.
     """
-    with made(out):
+    with locked_folder(out):
         return _merge_and_report(out, folders)
 
 

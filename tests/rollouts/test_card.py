@@ -17,9 +17,16 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evalua
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import disagreement
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
-from lerobot_memobench.run.card import extended, joined_runs, policy_facts, run_facts, training_facts, with_checkpoint
-from lerobot_memobench.run.run import resumed_card
-from lerobot_memobench.run.shards import merge
+from lerobot_memobench.rollouts.card import (
+    extended,
+    joined_runs,
+    policy_facts,
+    run_facts,
+    training_facts,
+    with_checkpoint,
+)
+from lerobot_memobench.rollouts.evaluate import resumed_card
+from lerobot_memobench.rollouts.shards import merge
 from tests.support import logs
 
 
@@ -74,7 +81,7 @@ def test_a_policy_is_known_by_settings_checkpoint_and_detector(tmp_path: Path, m
     cached = lambda repo, name: str(snapshot / name) if (snapshot / name).exists() else None  # noqa: E731
     monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", cached)
     plain: dict[str, Any] = {"policy": {"type": "act"}, "checkpoint": None, "trained_on": None}
-    monkeypatch.setattr("lerobot_memobench.run.card.identity_of", lambda policy, path, weights: f"act {weights}")
+    monkeypatch.setattr("lerobot_memobench.rollouts.card.identity_of", lambda policy, path, weights: f"act {weights}")
     of_path: Any = lambda path: SimpleNamespace(policy=None, policy_path=path)  # noqa: E731
     assert with_checkpoint(plain, of_path(None)) == {**plain, "policy": {"type": "act", "identity": "act None"}}
     assert with_checkpoint(plain, of_path("user/name")) == plain

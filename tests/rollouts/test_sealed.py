@@ -12,16 +12,17 @@ import pytest
 
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.envs.episode import Episode, generator, referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.protocol import SPLITS
-from lerobot_memobench.run.card import card_of
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.rerun import plan_of_card, settings_on
-from lerobot_memobench.run.shards import plan_shards
+from lerobot_memobench.rollouts.card import card_of
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.rerun import plan_of
+from lerobot_memobench.rollouts.settings import settings_of
+from lerobot_memobench.rollouts.shards import plan_shards
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.fake_loop import STOVE, FakeLoop
 
@@ -106,7 +107,7 @@ def test_resumed_and_repeated_runs_keep_the_salt(fake_loop: FakeLoop, capsys: py
     fake_loop.killed_after(1, "eval", *SEALED, "output_dir=a")
     salt = card_in("a")["protocol"]["salt"]
     assert main([*COMMAND, "output_dir=a", "resume=true"]) == 0
-    assert {each["salt"] for each in card_in("a")["episodes"]} == {salt} == {card_in("a")["protocol"]["salt"]}
+    assert {each["salt"] for each in read_runs([Path("a")])[0].records} == {salt} == {card_in("a")["protocol"]["salt"]}
     assert all(text in headline(read_runs([Path("a")])) for text in ("(sealed)", f"salt {salt}"))
     assert main(["rerun", "a", "--out", "again"]) == 0
     assert card_in("again")["protocol"]["salt"] == salt
@@ -116,10 +117,10 @@ def test_resumed_and_repeated_runs_keep_the_salt(fake_loop: FakeLoop, capsys: py
     assert main([*COMMAND, "shard=1/2", "output_dir=b"]) == 2
     assert "shard=1/2 of a sealed test without salt=" in capsys.readouterr().err
     card = card_of(plan_line([*SEALED, "output_dir=c"]))
-    assert plan_of_card({**card, "asked": settings_on(card)}, Path("d")).split == "sealed"
-    del card["settings"]["env"]["salt"]
+    assert plan_of(card, settings_of(card), Path("d")).split == "sealed"
+    del card["protocol"]["salt"]
     with pytest.raises(MemobenchError, match="test-sealed"):
-        plan_of_card({**card, "asked": settings_on(card)}, Path("d"))
+        plan_of(card, settings_of(card), Path("d"))
 
 
 def test_parts_share_the_salt_and_merge(fake_loop: FakeLoop) -> None:
@@ -132,4 +133,3 @@ def test_parts_share_the_salt_and_merge(fake_loop: FakeLoop) -> None:
         assert lerobot(job.arguments) == 0
     assert main(["merge", "b"]) == 0
     assert card_in("b")["protocol"]["salt"] == whole.environment.salt
-    assert {each["salt"] for each in card_in("b")["episodes"]} == {whole.environment.salt}

@@ -14,7 +14,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.run.plan import EvaluationPlan, plan_line
+from lerobot_memobench.rollouts.plan import EvaluationPlan, plan_line
 from lerobot_memobench.tasks.libero_suites import libero_tasks
 from tests.support.fake_loop import FakeLoop, content, make_checkpoint, results
 from tests.support.logs import write_log
@@ -258,7 +258,7 @@ def test_suites_are_averaged(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[
 def test_parts_and_resumed_runs_equal_a_whole_run(
     fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch, ending: list[str]
 ) -> None:
-    monkeypatch.setattr("lerobot_memobench.run.shards.ShardJob.run", lambda job: lerobot(job.arguments))
+    monkeypatch.setattr("lerobot_memobench.rollouts.shards.ShardJob.run", lambda job: lerobot(job.arguments))
     assert lerobot([*COMMAND, "output_dir=whole"]) == 0
     if ending == ["resume=true"]:
         fake_loop.killed_after(5, *COMMAND, "output_dir=out")

@@ -17,10 +17,10 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episode
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation, write_facts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.run import shards
-from lerobot_memobench.run.card import policy_facts, run_facts
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.shards import merge, merge_and_report, part_folders, plan_shards
+from lerobot_memobench.rollouts import shards
+from lerobot_memobench.rollouts.card import policy_facts, run_facts
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.shards import merge, merge_and_report, part_folders, plan_shards
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop
 from tests.support.logs import MISSING, SETTINGS, card, facts, record
 

@@ -24,8 +24,8 @@ from lerobot_memobench.policies.memory_reads import (
     reads_file,
     write_reads,
 )
-from lerobot_memobench.run.plan import plan_line
-from lerobot_memobench.run.shards import merge
+from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.shards import merge
 from tests.support.logs import record, write_log
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -20,18 +20,7 @@ from typing import Any
 from draccus.utils import is_enum, is_literal, is_union
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_memobench.envs.episode_log import key_of, read_log
-from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
-from lerobot_memobench.envs.pacing import longest
-from lerobot_memobench.envs.settings import EnvSettings, revision
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
-from lerobot_memobench.io import Malformed, checked, count_of, parsed
-from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
-from lerobot_memobench.protocol import HORIZON, SEALED
-from lerobot_memobench.run.card import PACKAGES, detector_hash, versions
-from lerobot_memobench.run.command_line import (
+from lerobot_memobench.commands.command_line import (
     NULLS,
     PLAIN,
     chosen_class,
@@ -40,9 +29,19 @@ from lerobot_memobench.run.command_line import (
     value_of,
     without_none,
 )
-from lerobot_memobench.run.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.run.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
-from lerobot_memobench.tasks.task import PUBLISHED, STANDARD
+from lerobot_memobench.constants import HORIZON, SEALED
+from lerobot_memobench.envs.episode_log import key_of, read_log
+from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
+from lerobot_memobench.envs.pacing import longest
+from lerobot_memobench.envs.settings import EnvSettings
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
+from lerobot_memobench.io import Malformed, checked, count_of, parsed
+from lerobot_memobench.policies.checkpoint import local_folder
+from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
+from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
+from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
+from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
@@ -69,27 +68,32 @@ def repeat(
     Args:
         path: the card, or its folder.
         out: folder of the repetition, a dated one when None.
-        server: see `repeatable_card`.
+        server: see `read_repeatable`.
         evaluate: runs the plan and returns its exit status.
         say: called with differences of this machine, and with the result.
 
     Raises:
         MemobenchError: the card cannot be repeated here.
     """
-    card = repeatable_card(path, server)
-    check_version(card)
-    check_policy(card)
+    card, settings = read_repeatable(path, server)
+    check_policy(card, settings.policy_path)
     for note in differences_here(card):
         say(f"note: {note}")
-    plan, episodes = plan_of_card(card, out), read_log(path if path.is_dir() else path.parent)
+    plan = plan_of(card, settings, out)
+    here = plan.environment.settings.protocol_block
+    if found := differences(card["protocol"], here):
+        start = card["runs"][-1]
+        raise MemobenchError(
+            f"another version ran the card ({'; '.join(found)}, there and here); repeat it with that version "
+            f"({start['versions'].get(PACKAGES[0], 'not known')}, commit {start['git_commit'] or 'not known'})"
+        )
+    episodes = read_log(path if path.is_dir() else path.parent)
     check_extent(card, episodes, plan)
-    if status := evaluate(plan):
-        return status
-    here = read_evaluation(plan.log)["protocol"]
     for note in (hashed := other_hashes(card["protocol"], here)):
         say(f"note: {note}")
-    problems = differences(card["protocol"], here)
-    problems += disagreements(episodes, read_log(plan.log), "there", "here", [SCENES] if hashed else [])
+    if status := evaluate(plan):
+        return status
+    problems = disagreements(episodes, read_log(plan.log), "there", "here", [SCENES] if hashed else [])
     if not problems:
         say(f"repeated: {count_of(len(episodes), 'episode')}, as in the log")
         return 0
@@ -97,8 +101,8 @@ def repeat(
     return 1
 
 
-def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
-    """Return the card of an evaluation, with ``asked``, its settings, checked by `allowed_settings`.
+def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, Any], EvaluationSettings]:
+    """Return the card of an evaluation and its settings, checked by `allowed_settings`.
 
     Args:
         path: the card's file or its folder.
@@ -108,15 +112,15 @@ def repeatable_card(path: Path, server: str | None = None) -> dict[str, Any]:
         MemobenchError: there is no card, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
-    return {**card, "asked": allowed_settings(settings_of(card), server)}
+    return card, allowed_settings(settings_of(card), server)
 
 
-def plan_of_card(card: Mapping[str, Any], out: Path | None = None) -> EvaluationPlan:
+def plan_of(card: Mapping[str, Any], settings: EvaluationSettings, out: Path | None = None) -> EvaluationPlan:
     """Return the plan of a card's evaluation, to be run in ``out``, or in a folder of the present time."""
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])
-    options = RunOptions(split=SEALED if card["asked"].env.get("salt") else None, shard=shard)
-    return make_plan(replace(card["asked"], output_dir=str(out)), options, ("memobench", "rerun"))
+    options = RunOptions(split=SEALED if settings.env.get("salt") else None, shard=shard)
+    return make_plan(replace(settings, output_dir=str(out)), options, ("memobench", "rerun"))
 
 
 # --- whether this machine and version can repeat it ---
@@ -129,12 +133,12 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
         MemobenchError: success, steps or checkpoints of an episode of its protocol are not in the log, an episode of
             another protocol is, or an episode may take more than `MOST_STEPS`.
     """
-    asked, grid = card["protocol"], plan.grid
+    protocol, grid = card["protocol"], plan.grid
     tasks = sorted(task.name for task in grid.tasks)
-    if (tasks, grid.runs) != (sorted(asked["tasks"]), asked["episodes"]):
+    if (tasks, grid.runs) != (sorted(protocol["tasks"]), protocol["episodes"]):
         raise MemobenchError(
             f"the card's settings run {grid.runs} episodes of {len(tasks)} tasks, and its protocol names "
-            f"{asked['episodes']} of {len(asked['tasks'])}; expected a card of `lerobot eval`"
+            f"{protocol['episodes']} of {len(protocol['tasks'])}; expected a card of `lerobot eval`"
         )
     most = longest(plan.environment.settings) + plan.environment.settings.longest_interference
     if most > MOST_STEPS:
@@ -152,34 +156,17 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
         )
 
 
-def check_version(card: Mapping[str, Any]) -> None:
-    """Refuse a card of a version with other goals or holds of strict tasks.
-
-    Raises:
-        MemobenchError: it names that version.
-    """
-    run, protocol = card["runs"][-1], card["protocol"]
-    version = f"{run['versions'].get(PACKAGES[0], 'not known')}, commit {run['git_commit'] or 'not known'}"
-    for name, here in revision(protocol.get("suite", PUBLISHED), protocol.get("difficulty", STANDARD)).items():
-        if (there := protocol.get(name)) != here:
-            raise MemobenchError(
-                f"another version ran the card ({name}={there} on the card, {name}={here} here); repeat it with that "
-                f"version ({version})"
-            )
-
-
-def check_policy(card: Mapping[str, Any]) -> None:
+def check_policy(card: Mapping[str, Any], path: str | None) -> None:
     """Refuse to repeat an evaluation with another checkpoint or detector.
 
     Raises:
         MemobenchError: one of them differs, or the card does not identify it.
     """
-    given = card["asked"].policy_path
-    if given is None:
+    if path is None:
         return
     policy = card["policy"]
     pairs = (
-        (f"checkpoint {given}", tree_hash(checkpoint_files(Path(given))), policy.get("sha256")),
+        (f"checkpoint {path}", tree_hash(checkpoint_files(Path(path))), policy.get("sha256")),
         (
             f"detector {policy.get('settings', {}).get('detector')}",
             detector_hash(policy.get("settings", {})),
@@ -212,7 +199,7 @@ def differences_here(card: Mapping[str, Any]) -> list[str]:
 # --- settings that a card may hold ---
 
 
-def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
+def allowed_settings(settings: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
     """Return a card's settings, checked, with the policy's checkpoint by its folder.
 
     Args:
@@ -221,9 +208,9 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
     Raises:
         MemobenchError: a card may not hold one of them.
     """
-    if not all(OBSERVATION.fullmatch(name) for pair in asked.rename_map.items() for name in pair):
-        raise _refused("rename_map", asked.rename_map, "expected names of observations")
-    for name, value in asked.env.items():
+    if not all(OBSERVATION.fullmatch(name) for pair in settings.rename_map.items() for name in pair):
+        raise _refused("rename_map", settings.rename_map, "expected names of observations")
+    for name, value in settings.env.items():
         if name not in ENVIRONMENT or name in ("task", "task_ids", "log_dir", "resume"):
             raise _refused(f"env.{name}", value, "no card sets it")
         if name == "tasks" and not (isinstance(value, str) and WORD.fullmatch(value)):
@@ -232,8 +219,8 @@ def allowed_settings(asked: EvaluationSettings, server: str | None = None) -> Ev
             raise _refused("env.task_dir", value, "expected a folder on this machine")
         if name in MOST and isinstance(value, int) and value > MOST[name]:
             raise _refused(f"env.{name}", value, f"expected at most {MOST[name]:,}")
-    EnvSettings(**{name: value for name, value in asked.env.items() if name not in OWN})
-    return replace(asked, policy=_allowed_policy(dict(asked.policy), server))
+    EnvSettings(**{name: value for name, value in settings.env.items() if name not in OWN})
+    return replace(settings, policy=_allowed_policy(dict(settings.policy), server))
 
 
 def _allowed_policy(policy: dict[str, Any], server: str | None) -> dict[str, Any]:

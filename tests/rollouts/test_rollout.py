@@ -26,8 +26,8 @@ from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memory_reads import find_reads, noting_reads
-from lerobot_memobench.run import evaluate as evaluation
-from lerobot_memobench.run.rollout import Actor, BatchSeeds, batch_seed, roll
+from lerobot_memobench.rollouts import evaluate as evaluation
+from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, batch_seed, roll
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import task_folder
 

@@ -1,0 +1,1 @@
+"""Parse command lines into LeRobot's typed configurations, and call LeRobot's commands."""
