@@ -39,7 +39,7 @@ RATES = (
 
 def departures(run: Run) -> list[str]:
     """Return a phrase for each departure of an evaluation from the paper's protocol."""
-    tasks, counts = run.summary.tasks, {row["SR"].n for row in run.summary.tasks.values()}
+    tasks, counts = run.summary.tasks, {task.rates["SR"].n for task in run.summary.tasks.values()}
     found = [] if len(tasks) == TASKS else [f"{len(tasks)} of {TASKS} tasks"]
     if counts != {EPISODES}:
         found.append(f"{' to '.join(map(str, sorted({min(counts), max(counts)})))} episodes of each, not {EPISODES}")

@@ -23,7 +23,7 @@ from lerobot_memobench.evaluation.statistics import (
     detectable,
     difference_interval,
     holm,
-    percentiles,
+    interval_of,
     sign_flip,
 )
 
@@ -97,10 +97,9 @@ def average_success(runs: Runs) -> Estimate:
     weights, tasks = _weights(runs[0], episodes)
     table = _successes(runs, episodes, "training seeds")
     value = float((table @ weights).mean())
-    low, high = percentiles(_draws(table, weights, tasks, np.random.default_rng(0)))
     # An episode counts once, however many policies ran it.
-    least, most = wilson(min(value, 1.0), 1 / float(np.sum(weights**2)))
-    return Estimate(value, min(low, least), max(high, most))
+    bounds = wilson(min(value, 1.0), 1 / float(np.sum(weights**2)))
+    return Estimate(value, *interval_of(_draws(table, weights, tasks, np.random.default_rng(0)), bounds))
 
 
 def _p_of_seeds(differences: Array) -> float | None:

@@ -151,9 +151,8 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
             f"{folder}.json and evaluate it again"
         )
     summary = run.summary
-    types, tasks = (
-        {name: _percentages(row) for name, row in rows.items()} for rows in (summary.memory_types, summary.tasks)
-    )
+    types = {name: _percentages(row) for name, row in summary.memory_types.items()}
+    tasks = {name: _percentages(task.rates) for name, task in summary.tasks.items()}
     counted = {"tasks": tasks, "memory_types": types, "average": _percentages(summary.average)}
     return {**counted, "failures": dict(summary.failures), **evidence_values(run)}
 

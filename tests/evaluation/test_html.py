@@ -184,7 +184,6 @@ def test_a_film_belongs_to_the_rollout_that_is_as_long(tmp_path: Path) -> None:
     assert found == {0: videos / f"{STOVE}.0.mp4", 2: videos / f"{STOVE}.2.mp4"}
     assert len(notes) == 1
     assert f"{STOVE}.1.mp4" in notes[0]
-    assert find_videos(tmp_path, [record(), record(referent="random")])[0] == {}, "it could be of either"
 
 
 @pytest.mark.parametrize(

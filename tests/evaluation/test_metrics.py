@@ -15,7 +15,6 @@ from lerobot_memobench.evaluation.metrics import (
     faults,
     inputs_phrase,
     mean_rate,
-    mixtures,
     report_values,
     summary_of,
     wilson,
@@ -84,8 +83,8 @@ def test_report_of_the_hand_made_log() -> None:
 def test_ordered_prefix_counts_only_what_came_in_order() -> None:
     late = rollout("t1", "temporal", "SU", [9, 3], True, ordered=[9, None])
     summary = summary_of([late])
-    assert [rate.value for rate in summary.prefix["t1"]] == [1.0, 1.0]
-    assert [rate.value for rate in summary.ordered_prefix["t1"]] == [1.0, 0.0]
+    assert [rate.value for rate in summary.tasks["t1"].prefix] == [1.0, 1.0]
+    assert [rate.value for rate in summary.tasks["t1"].ordered_prefix] == [1.0, 0.0]
 
 
 def test_pooled_rate_is_over_all_checkpoint_records() -> None:
@@ -105,33 +104,12 @@ def test_versions_of_a_task_are_not_mixed() -> None:
         by_task([rollout("t", "musical", "S", [1], True)])
 
 
-SHARED = {"referent": "fixed", "inputs": "pixels"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({}, ""),
-        ({"referent": "random"}, "referent settings (fixed, random)"),
-        ({"replan_steps": 20}, "replan intervals (20, 5)"),
-        ({"seed": 5002}, "seeds of episode 0 (7, 4999)"),
-        ({"inputs": "poses"}, "policy inputs (pixels, poses)"),
-    ],
-)
-def test_mixed_protocols_are_noted(changes: dict[str, Any], named: str) -> None:
-    mine = [rollout("t", "temporal", "S", [1], True, k, **SHARED) for k in range(3)]
-    notes = mixtures([*mine, rollout("t", "temporal", "S", [1], True, 3, **{**SHARED, **changes})])
-    assert [named in note for note in notes] == ([True] if named else [])
-    assert mixtures([rollout("t", "temporal", "S", [1], True, k) for k in range(2)]) == [], "equal protocols"
-
-
 def test_sentences_of_one_rollout_are_singular() -> None:
     one = rollout("t", "temporal", "S", [1], True, fault="NaN")
     assert "1 rollout was broken off and counts as failed" in faults([one])[0]
     assert "(1 record)" in pooled_sentence(summary_of([one]))
     inputs = inputs_phrase([{**one, "inputs": "privileged object state"}, one])
-    assert inputs == "privileged object state; of 1 rollout it is not recorded"
-    assert inputs_phrase([one]) == "not recorded"
+    assert inputs == "not recorded; privileged object state"
 
 
 @pytest.mark.parametrize("n", [1, 40])

@@ -122,9 +122,9 @@ def test_rollouts_beyond_the_request_are_left_out(tmp_path: Path) -> None:
     protocol = {**SETTINGS, "tasks": ["one", "two_of_them"], "episodes": 3}
     write_evaluation(folder, facts(protocol, {"seed": 7}))
     (run,) = read_runs([folder])
-    assert [row["SR"].n for row in run.summary.tasks.values()] == [3, 3]
+    assert [task.rates["SR"].n for task in run.summary.tasks.values()] == [3, 3]
     assert run.notes == ["2 rollouts beyond those that were asked for left out"]
-    assert write_report(folder).summary.tasks["one"]["SR"].n == 3
+    assert write_report(folder).summary.tasks["one"].rates["SR"].n == 3
     assert read_run(folder).notes == run.notes, "they stay in the log"
     write_evaluation(folder, facts(protocol, {"seed": 9}))
     assert len(read_run(folder).records) == 4, "episodes 2, 3 and 4 were asked for, and 4 is missing"

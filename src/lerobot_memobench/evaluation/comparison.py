@@ -44,9 +44,9 @@ from lerobot_memobench.evaluation.statistics import (
     detectable,
     difference_interval,
     holm,
+    interval_of,
     mcnemar,
     newcombe,
-    percentiles,
     sign_flip,
 )
 from lerobot_memobench.evaluation.tables import (
@@ -84,7 +84,7 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
             )
     unlike = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
     names = [each.split(":")[0] for each in unlike]
-    pairs = _common_episodes(a, b, {*allow, *names})
+    pairs = _common_episodes(a, b)
     unlike_episodes = _unlike_episodes(pairs, {*allow, *names})
     if unlike or unlike_episodes:
         names += unlike_episodes
@@ -98,13 +98,12 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
     return pairs
 
 
-def _common_episodes(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
-    """Return the rollouts of the same task, number and referent; under different salts, of the same variant too."""
+def _common_episodes(a: Run, b: Run) -> list[Pair]:
+    """Return the rollouts of the same task and number; under different salts, of the same variant too."""
     redrawn = other_draws(a, b)
 
-    def key(record: Record) -> tuple[str, int, str, int | None]:
-        referent = "" if "referent" in allow else str(record.get("referent", "fixed"))
-        return record["task"], record["episode"], referent, record.get("variant") if redrawn else None
+    def key(record: Record) -> tuple[str, int, int | None]:
+        return record["task"], record["episode"], record.get("variant") if redrawn else None
 
     others = {key(record): record for record in b.records}
     pairs = [(record, others[key(record)]) for record in a.records if key(record) in others]
@@ -279,7 +278,7 @@ class _Task(NamedTuple):
 
 def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
     partners = {id(mine): other for mine, other in pairs}
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
     tasks = []
     for name, group in by_task(mine for mine, _ in pairs).items():
         both = [(mine, partners[id(mine)]) for mine in group]
@@ -289,7 +288,7 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
         if by_checkpoint:
             reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
             values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        scenes = _scenes(group)
+        scenes = _scenes(group)  # rollouts of one scene depend on each other, so they are drawn together
         drawn = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
         samples = {
             metric: _Sample(value, value[drawn].mean(axis=1))
@@ -396,9 +395,8 @@ def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Es
     shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
     if value is None or len(shares) <= 0.9 * len(drawn):
         return Estimate(value)
-    least, most = (bound / (1.0 - a) for bound in bounds)
-    low, high = percentiles(np.array(shares))
-    return Estimate(value, min(low, least), min(max(high, most), 1.0))
+    low, high = interval_of(np.array(shares), (bounds[0] / (1.0 - a), bounds[1] / (1.0 - a)))
+    return Estimate(value, low, min(high, 1.0))
 
 
 # --- the report ---

@@ -18,7 +18,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
-from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, percentiles
+from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, interval_of
 from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, percent_text, with_interval
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
@@ -94,7 +94,7 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
     groups = _by_task(records)
     if not groups:
         return None
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # the same log has the same intervals
     tasks: dict[str, _Task] = {}
     types: dict[str, list[_Task]] = {}
     left_out, without_rate = 0, list[str]()
@@ -197,6 +197,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     chances = [[task.chance for task in group] for group in groups]
     permuted = mean([[task.permuted for task in group] for group in groups])
     return Evidence(
+        # Equal means of other orders of addition may differ in their last bits.
         p=(1 + int((permuted >= rates[0] - 1e-9).sum())) / (1 + len(permuted)),
         effective=scenes,
         scenes=sum(len(task.values) for task in tasks),
@@ -207,8 +208,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
 
 
 def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
-    (low, high), (least, most) = percentiles(drawn), wilson(min(float(rate), 1.0), scenes)
-    return Estimate(float(rate), min(low, least), max(high, most))
+    return Estimate(float(rate), *interval_of(drawn, wilson(min(float(rate), 1.0), scenes)))
 
 
 # --- the report ---

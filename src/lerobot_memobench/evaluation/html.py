@@ -1,6 +1,7 @@
 """The report for the browser: one page with its script, style and data inside, and a folder of videos.
 
-`metrics` computes all rates; the page (``page/``) only draws and filters. Its content security policy allows only this
+`metrics` computes all rates; the page (``page/``) only draws and filters. Everything but the videos is inside
+``index.html``, because a browser lets a page from disk read no other file. Its content security policy allows only this
 style, this script and videos in its own folder, so the page cannot reach the network.
 """
 
@@ -14,7 +15,6 @@ import os
 import re
 import shlex
 import shutil
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -113,7 +113,7 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
         if not (out / PAGE).exists():
             write_file(out / PAGE, UNFINISHED)  # marks the folder as a report
         place_videos(chosen)
-        write_file(out / PAGE, text)
+        write_file(out / PAGE, text)  # after its videos, so that a killed command leaves no links to missing ones
         linked = _remove_other_videos(out, chosen)
     return HtmlReport(
         page=out / PAGE,
@@ -182,10 +182,6 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
                     videos[k] = video
                 else:
                     misfits.append(video.name)
-    # A video's name does not hold the referent: where both settings are in one log, it could be of either.
-    claims = Counter(videos.values())
-    misfits += [video.name for video, count in claims.items() if count > 1]
-    videos = {k: video for k, video in videos.items() if claims[video] == 1}
     if not misfits:
         return videos, []
     listed = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
@@ -320,13 +316,13 @@ def evaluation_on_page(
         "memory_types": {name: row_data(row) for name, row in summary.memory_types.items()},
         "tasks": {
             name: {
-                "rates": row_data(row),
-                "operations": summary.operations_of[name],
-                "prefix": [rate_data(rate) for rate in summary.prefix[name]],
-                "ordered_prefix": [rate_data(rate) for rate in summary.ordered_prefix[name]],
+                "rates": row_data(task.rates),
+                "operations": task.operations,
+                "prefix": [rate_data(rate) for rate in task.prefix],
+                "ordered_prefix": [rate_data(rate) for rate in task.ordered_prefix],
                 "outcomes": outcomes(summary, [name]),
             }
-            for name, row in summary.tasks.items()
+            for name, task in summary.tasks.items()
         },
         "episodes": [episode_data(record, videos.get(k), reads.get(k, ())) for k, record in enumerate(run.records)],
     }

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from lerobot_memobench.envs.episode_log import seed_base
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
@@ -85,25 +84,13 @@ NOT_RECORDED = "not recorded"
 
 
 def inputs_phrase(records: Iterable[Record]) -> str:
-    """Return the inputs that rollouts record, and how many rollouts record none where others do."""
-    known = Counter(str(record.get("inputs") or NOT_RECORDED) for record in records)
-    unknown = known.pop(NOT_RECORDED, 0)
-    rest = [f"of {count_of(unknown, 'rollout')} it is {NOT_RECORDED}"] if known and unknown else []
-    return "; ".join([*sorted(known), *rest]) or NOT_RECORDED
+    """Return the inputs that rollouts record; they differ only between evaluations."""
+    return "; ".join(sorted({str(record.get("inputs") or NOT_RECORDED) for record in records})) or NOT_RECORDED
 
 
 def varies(record: Record) -> bool:
     """Return whether the scene of a rollout is run with several variants."""
     return (record.get("variants") or 1) > 1
-
-
-PROTOCOL: dict[str, Callable[[Record], Any]] = {
-    "referent settings": lambda record: str(record.get("referent")),
-    "replan intervals": lambda record: str(record.get("replan_steps")),
-    "policy inputs": lambda record: record.get("inputs"),
-    "seeds of episode 0": lambda record: None if record.get("seed") is None else seed_base(record),
-}
-"""Parts of the protocol that should agree within a report -> its value in a record, None where it has none."""
 
 
 def notes_on(records: Sequence[Record]) -> list[str]:
@@ -114,7 +101,7 @@ def notes_on(records: Sequence[Record]) -> list[str]:
             f"{task}: the demonstration prompt did not show its scene in {count_of(len(group), 'rollout')}, the first "
             f"in episode {group[0]['episode']}; no memory of it can solve the task"
         )
-    notes += unsettled(records) + mixtures(records)
+    notes += unsettled(records)
     if missing := stand_ins_of(records):
         notes.append(
             f"this package's objects replaced the missing scans {', '.join(missing)}: figures with and without them do "
@@ -149,18 +136,6 @@ def unsettled(records: Iterable[Record]) -> list[str]:
     place = "results/unsettled_scenes.md lists those of the paper's seeds"
     note = f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"
     return [note] if counts else []
-
-
-def mixtures(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each part of the protocol in which rollouts differ."""
-    records = list(records)
-    notes = []
-    for words, value in PROTOCOL.items():
-        values = sorted({value(record) for record in records} - {None})
-        if len(values) > 1:
-            listed = ", ".join(map(str, values[:5])) + (", …" if len(values) > 5 else "")
-            notes.append(f"The rollouts mix {words} ({listed}); the figures are over all of them.")
-    return notes
 
 
 def stand_ins_of(records: Iterable[Record]) -> list[str]:
@@ -380,36 +355,43 @@ SUITE: Final = "suite"
 
 
 @dataclass(frozen=True)
+class TaskSummary:
+    """All rates of one task's rollouts.
+
+    Attributes:
+        operations: labels of the checkpoints, such as "SUU".
+        prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any order.
+        ordered_prefix: the same in order.
+        failures: class -> number of failed rollouts.
+    """
+
+    memory_type: str
+    operations: str
+    rates: Row
+    prefix: list[Rate]
+    ordered_prefix: list[Rate]
+    failures: dict[str, int]
+
+
+@dataclass(frozen=True)
 class Summary:
     """All rates of a set of rollouts.
 
     Attributes:
-        tasks: name -> metrics.
         memory_types: name -> metrics, each the mean over its applicable tasks; a suite of LIBERO is one of them.
         average: mean over the applicable memory types.
         pooled: MSR, MUR, MCR over all checkpoint records of the operation, of all tasks; n counts records.
         pooled_checkpoints: the same over all checkpoint records, of all operations.
-        prefix: task -> per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any
-            order.
-        ordered_prefix: the same in order.
         failures: class -> number of failed rollouts.
-        failures_of: the same by task.
-        memory_type_of: task -> memory type.
-        operations_of: task -> its checkpoints' labels, such as "SUU".
         inputs: of the policy, in words.
     """
 
-    tasks: dict[str, Row]
+    tasks: dict[str, TaskSummary]
     memory_types: dict[str, Row]
     average: Row
     pooled: Row
     pooled_checkpoints: Rate
-    prefix: dict[str, list[Rate]]
-    ordered_prefix: dict[str, list[Rate]]
     failures: dict[str, int]
-    failures_of: dict[str, dict[str, int]]
-    memory_type_of: dict[str, str]
-    operations_of: dict[str, str]
     inputs: str
 
     @property
@@ -428,19 +410,31 @@ class Summary:
         """How many rollouts there are."""
         return self.pooled["SR"].n
 
+    def tasks_of(self, memory_type: str) -> list[str]:
+        """Return the names of a memory type's tasks, or of a suite's."""
+        return [name for name, task in self.tasks.items() if task.memory_type == memory_type]
+
 
 def summary_of(records: Iterable[Record]) -> Summary:
     """Compute all rates of a set of rollouts."""
     records = list(records)
     if not records:
         raise MemobenchError("there are no rollouts to report; run an evaluation first")
-    groups = by_task(records)
-    tasks = {name: task_row(group) for name, group in groups.items()}
-    memory_type_of = {name: str(group[0]["memory_type"]) for name, group in groups.items()}
-    memory_types: dict[str, Row] = {
-        memory_type: mean_row(tasks[name] for name in tasks if memory_type_of[name] == memory_type)
+    tasks = {
+        name: TaskSummary(
+            str(group[0]["memory_type"]),
+            operations(group[0]),
+            task_row(group),
+            _prefix_rates(group, satisfied),
+            _prefix_rates(group, completed_in_order),
+            failure_counts(group),
+        )
+        for name, group in by_task(records).items()
+    }
+    memory_types = {
+        memory_type: mean_row(rows)
         for memory_type in GROUPS
-        if memory_type in memory_type_of.values()
+        if (rows := [task.rates for task in tasks.values() if task.memory_type == memory_type])
     }
     return Summary(
         tasks=tasks,
@@ -448,12 +442,7 @@ def summary_of(records: Iterable[Record]) -> Summary:
         average=mean_row(memory_types.values()),
         pooled=pooled_row(records),
         pooled_checkpoints=share([done for record in records for done in satisfied(record)]),
-        prefix={name: _prefix_rates(group, satisfied) for name, group in groups.items()},
-        ordered_prefix={name: _prefix_rates(group, completed_in_order) for name, group in groups.items()},
         failures=failure_counts(records),
-        failures_of={name: failure_counts(group) for name, group in groups.items()},
-        memory_type_of=memory_type_of,
-        operations_of={name: operations(group[0]) for name, group in groups.items()},
         inputs=inputs_phrase(records),
     )
 
@@ -461,11 +450,11 @@ def summary_of(records: Iterable[Record]) -> Summary:
 def report_values(summary: Summary) -> dict[str, Any]:
     """Return the content of ``report.json``: percentages with one decimal, null where not applicable."""
     return {
-        "tasks": {name: _percentages(row) for name, row in summary.tasks.items()},
+        "tasks": {name: _percentages(task.rates) for name, task in summary.tasks.items()},
         "memory_types": {name: _percentages(row) for name, row in summary.memory_types.items()},
         "average": _percentages(summary.average),
         "failures": dict(summary.failures),
-        "prefix": {name: [percent(rate.value) for rate in rates] for name, rates in summary.prefix.items()},
+        "prefix": {name: [percent(rate.value) for rate in task.prefix] for name, task in summary.tasks.items()},
         "inputs": summary.inputs,
     }
 

@@ -155,12 +155,12 @@ class Bar(NamedTuple):
 
 def bars(runs: Sequence[Run]) -> list[Bar]:
     """Return the bars of all rollouts, then of each memory type."""
-    types = dict.fromkeys(memory_type for run in runs for memory_type in run.summary.memory_type_of.values())
+    types = dict.fromkeys(task.memory_type for run in runs for task in run.summary.tasks.values())
     return [
         Bar(heading, run.name if len(runs) > 1 else "", outcomes(run.summary, tasks))
         for heading in ("all rollouts", *types)
         for run in runs
-        if (tasks := [task for task, kind in run.summary.memory_type_of.items() if heading in ("all rollouts", kind)])
+        if (tasks := [*run.summary.tasks] if heading == "all rollouts" else run.summary.tasks_of(heading))
     ]
 
 

@@ -132,7 +132,7 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
 def _sections(run: Run) -> list[Section]:
     """Return the tables of an evaluation, and of its evidence where scenes were run with each variant."""
     summary = run.summary
-    prefixes = [prefix_table(summary)] if any(summary.prefix.values()) else []
+    prefixes = [prefix_table(summary)] if any(task.prefix for task in summary.tasks.values()) else []
     tables = [memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary)]
     noted = [replace(table, note=f"{table.note} Policy inputs: {summary.inputs}.".strip()) for table in tables]
     evidence = [] if run.evidence is None else [evidence_section(run.evidence)]
@@ -160,16 +160,18 @@ def evaluation_data(run: Run) -> dict[str, Any]:
         "protocol": {key: value for key, value in run.protocol.items() if key != POLICY},
         "policy": {key: policy.get(key) for key in ("type", "sha256", "seed")},
         "intervals": {
-            "tasks": {name: _intervals(row) for name, row in summary.tasks.items()},
+            "tasks": {name: _intervals(task.rates) for name, task in summary.tasks.items()},
             "memory_types": {name: _intervals(row) for name, row in summary.memory_types.items()},
             "average": _intervals(summary.average),
         },
-        "ordered_prefix": {name: [percent(each.value) for each in rs] for name, rs in summary.ordered_prefix.items()},
+        "ordered_prefix": {
+            name: [percent(rate.value) for rate in task.ordered_prefix] for name, task in summary.tasks.items()
+        },
         "pooled": {
             "checkpoints": _pooled(summary.pooled_checkpoints),
             **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
         },
-        "failures_by_task": {name: dict(counts) for name, counts in summary.failures_of.items()},
+        "failures_by_task": {name: dict(task.failures) for name, task in summary.tasks.items()},
         "missing": run.missing,
         "notes": list(run.notes),
     }
@@ -229,8 +231,8 @@ def rates_table(summary: Summary) -> Table:
     strong, rules = set(), set()
     for group, row in {**summary.memory_types, **summary.means}.items():
         rules.add(len(rows))
-        names = _tasks_of(summary, group)
-        rows += [rate_row(Name(name), summary.tasks[name]) for name in names]
+        names = summary.tasks_of(group)
+        rows += [rate_row(Name(name), summary.tasks[name].rates) for name in names]
         strong.add(len(rows))
         rows.append(rate_row(f"{group} ({count_of(len(names), 'task')})" if names else group, row))
     header = ("task", "n", *summary.average)
@@ -254,9 +256,8 @@ def memory_types_table(summary: Summary) -> Table:
 
 def tasks_table(summary: Summary) -> Table:
     """Return one row per task."""
-    names = list(summary.tasks)
-    types = [summary.memory_type_of[name] for name in names]
-    rows = [rate_row(Name(name), summary.tasks[name]) for name in names]
+    types = [task.memory_type for task in summary.tasks.values()]
+    rows = [rate_row(Name(name), task.rates) for name, task in summary.tasks.items()]
     rules = [k for k in range(1, len(types)) if types[k] != types[k - 1]]
     return with_ids(Table("tasks", "Rates by task", ("task", "n", *summary.average), rows, rules=rules))
 
@@ -268,12 +269,11 @@ def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
 
 def prefix_table(summary: Summary) -> Table:
     """Return per task how many rollouts came as far as each checkpoint, in any order and in order."""
-    width = max(map(len, summary.prefix.values()), default=0)
+    width = max(len(task.prefix) for task in summary.tasks.values())
     rows = []
-    for name, plain in summary.prefix.items():
-        cells: list[Cell] = [PrefixRates(*pair) for pair in zip(plain, summary.ordered_prefix[name], strict=True)]
-        labels = " ".join(summary.operations_of[name])
-        rows.append((Name(name), labels, *cells, *[Numbers("")] * (width - len(cells))))
+    for name, task in summary.tasks.items():
+        cells: list[Cell] = [PrefixRates(*pair) for pair in zip(task.prefix, task.ordered_prefix, strict=True)]
+        rows.append((Name(name), " ".join(task.operations), *cells, *[Numbers("")] * (width - len(cells))))
     return Table(
         "prefix",
         "Prefix completion, in any order / in order",
@@ -306,7 +306,7 @@ def failures_table(summary: Summary) -> Table:
     """Return how rollouts ended, in all and by memory type."""
     counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
     for memory_type in summary.memory_types if len(summary.memory_types) > 1 else ():
-        counts[memory_type] = outcomes(summary, _tasks_of(summary, memory_type))
+        counts[memory_type] = outcomes(summary, summary.tasks_of(memory_type))
     total = summary.rollouts
     rows: list[tuple[Cell, ...]] = []
     for outcome in ("success", *summary.failures):
@@ -325,13 +325,9 @@ def failures_table(summary: Summary) -> Table:
 
 def outcomes(summary: Summary, names: Iterable[str]) -> dict[str, int]:
     """Return how the rollouts of some tasks ended: success, then every class of failure -> rollouts."""
-    names = list(names)
-    failed = {failure: sum(summary.failures_of[name].get(failure, 0) for name in names) for failure in summary.failures}
-    return {"success": sum(summary.tasks[name]["SR"].n for name in names) - sum(failed.values()), **failed}
-
-
-def _tasks_of(summary: Summary, memory_type: str) -> list[str]:
-    return [name for name, its_type in summary.memory_type_of.items() if its_type == memory_type]
+    tasks = [summary.tasks[name] for name in names]
+    failed = {failure: sum(task.failures.get(failure, 0) for task in tasks) for failure in summary.failures}
+    return {"success": sum(task.rates["SR"].n for task in tasks) - sum(failed.values()), **failed}
 
 
 # --- several evaluations, in the layout of the paper's main table: every memory type's rates in one row ---
@@ -384,6 +380,7 @@ def joined_table(runs: Sequence[Run]) -> Table:
     metrics = tuple(runs[0].summary.average)
     absent: Row = dict.fromkeys(metrics, Rate(None, 0))
     summaries = [run.summary for run in runs]
+    tasks = [{name: task.rates for name, task in each.tasks.items()} for each in summaries]
     rows: list[tuple[Cell, ...]] = []
     strong, rules = set(), set()
 
@@ -392,9 +389,9 @@ def joined_table(runs: Sequence[Run]) -> Table:
         rows.append((name, *(row[metric] for metric in metrics for row in each)))
 
     for memory_type in GROUPS:
-        names = dict.fromkeys(name for each in summaries for name in _tasks_of(each, memory_type))
+        names = dict.fromkeys(name for each in summaries for name in each.tasks_of(memory_type))
         for name in names:
-            add(Name(name), (each.tasks for each in summaries))
+            add(Name(name), tasks)
         if names:
             strong.add(len(rows))
             add(memory_type, (each.memory_types for each in summaries))

@@ -63,7 +63,7 @@ def sign_flip(
     """
     terms = np.asarray(differences, dtype=np.float64) * np.asarray(weights, dtype=np.float64)
     terms = terms[np.abs(terms) > _TOLERANCE]
-    observed = abs(float(terms.sum())) - _TOLERANCE
+    observed = abs(float(terms.sum())) - _TOLERANCE  # sums that are equal but for rounding are as extreme
     if terms.size == 0:
         return 1.0, True
     if terms.size <= EXACT_UP_TO:
@@ -140,10 +140,10 @@ class Estimate:
     high: float | None = None
 
 
-def percentiles(values: Array) -> tuple[float, float]:
-    """Return the 95 % interval of draws."""
-    low, high = np.percentile(values, [2.5, 97.5])
-    return float(low), float(high)
+def interval_of(draws: Array, bounds: tuple[float, float]) -> tuple[float, float]:
+    """Return the 95 % interval of bootstrap draws, at least as wide as ``bounds``."""
+    low, high = np.percentile(draws, [2.5, 97.5])
+    return min(float(low), bounds[0]), max(float(high), bounds[1])
 
 
 def difference_interval(draws: Array, a: Array, b: Array, weights: Array) -> tuple[float, float]:
@@ -152,9 +152,7 @@ def difference_interval(draws: Array, a: Array, b: Array, weights: Array) -> tup
     Args:
         draws: (D,) of that mean. a, b: (n,) outcomes in [0, 1] of the same episodes. weights: (n,), their sum is 1.
     """
-    low, high = percentiles(draws)
-    least, most = newcombe(a, b, weights)
-    return min(low, least), max(high, most)
+    return interval_of(draws, newcombe(a, b, weights))
 
 
 def newcombe(a: Array, b: Array, weights: Array) -> tuple[float, float]:
