@@ -41,7 +41,7 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.compatibility import trained_convention
-from lerobot_memobench.policies.remote_connection import pack, unpack
+from lerobot_memobench.policies.remote_connection import pack, unpack_message
 from lerobot_memobench.sim.convention import STATED
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
@@ -126,7 +126,7 @@ def make_server(policy: ServedPolicy, host: str, port: int) -> Server:
             for frame in connection:
                 try:
                     assert isinstance(frame, bytes), "openpi's questions are binary frames"
-                    answer = pack(policy.answer(unpack(frame)))
+                    answer = pack(policy.answer(unpack_message(frame)))
                 except Exception:
                     connection.send(traceback.format_exc())
                     connection.close(FAILED)

@@ -314,7 +314,7 @@ def schemas_page() -> str:
         ("evaluation.json", evaluation_file.Card),
         ("Its protocol", evaluation_file.Protocol),
         ("Policy of a card", evaluation_file.Policy),
-        ("Checkpoint of a card", evaluation_file.Checkpoint),
+        ("Checkpoint of a card", evaluation_file.ModelFiles),
         ("One start", evaluation_file.Start),
         ("Settings of a card", evaluation_file.CardSettings),
     ]

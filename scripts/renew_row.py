@@ -17,7 +17,7 @@ import lerobot_policy_memobench  # noqa: F401 - registers policies
 from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, About, write_submission
 from lerobot_memobench.cli.lerobot import evaluate_here
 from lerobot_memobench.envs.evaluation_file import read_evaluation
-from lerobot_memobench.rollouts.rerun import plan_of, read_repeatable
+from lerobot_memobench.rollouts.rerun import plan_of_evaluation, read_repeatable
 
 
 def renew(row: Path, out: Path) -> int:
@@ -26,7 +26,7 @@ def renew(row: Path, out: Path) -> int:
     sources = {}
     for control in ("", *(name for name in CONTROLS if (row / name / CARD).exists())):
         sources[control] = out / row.name / (control or "evaluation")
-        plan = plan_of(*read_repeatable(row / control), sources[control])
+        plan = plan_of_evaluation(*read_repeatable(row / control), sources[control])
         if status := evaluate_here(replace(plan, options=replace(plan.options, resume=True))):
             return status
     print(write_submission(row, about, sources))

@@ -27,11 +27,11 @@ from PIL import Image
 from lerobot_memobench.cli import memobench
 from lerobot_memobench.commands.command_line import (
     HELP,
+    as_command_line,
     is_of_benchmark,
     parse_words,
     read_words,
     resolve_recipe,
-    spelled,
     typed,
 )
 from lerobot_memobench.envs import episode_log, evaluation_file
@@ -332,7 +332,7 @@ def check(words: list[str]) -> None:
         case "lerobot":
             check_lerobot(rest[0], rest[1:])
         case "lerobot-eval" | "lerobot-train":
-            check_lerobot(program.partition("-")[2], [as_pair(word) for word in spelled(parse_words(rest))])
+            check_lerobot(program.partition("-")[2], [as_pair(word) for word in as_command_line(parse_words(rest))])
         case "memobench":
             check_memobench(rest)
         case _ if program == "python" or program.endswith("/bin/python"):

@@ -19,7 +19,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.remote import RemoteConfig, RemotePolicy
-from lerobot_memobench.policies.remote_connection import pack, unpack
+from lerobot_memobench.policies.remote_connection import pack, unpack_message
 from lerobot_memobench.rollouts.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
@@ -161,7 +161,7 @@ def test_openpi_server_computes_object_state_from_libero_state() -> None:
     sim = simulate("turn_on_the_stove_and_turn_it_off_near_the_shelf")
     for seed in (20_000, 20_001):
         sim.reset(seed)
-        sent = unpack(pack({"state": sim.state(), "fixtures": sim.fixture_poses()}))
+        sent = unpack_message(pack({"state": sim.state(), "fixtures": sim.fixture_poses()}))
         slots = example["objects"](sim.task.name, sent["state"], sent["fixtures"])
         assert np.array_equal(slots, ObjectSlots(sim).observe())
 

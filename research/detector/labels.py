@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.objects import DRAWERS, PARTS
-from lerobot_memobench.perception.visual_encoder import SIDE, resized
+from lerobot_memobench.perception.visual_encoder import SIDE, area_averaged
 from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import SLOTS
 from lerobot_memobench.sim.object_slots import ObjectSlots, Thing, classes, is_lit
@@ -112,7 +112,7 @@ class Labeller:
         """Return the present image of a camera (`agentview` or `wrist`), one row () of `PICTURE`."""
         sim, row = self._sim, np.zeros((), PICTURE)
         image = torch.from_numpy(sim.render(camera)).permute(2, 0, 1)[None]
-        row["pixels"] = resized(image)[0].round().to(torch.uint8).numpy()
+        row["pixels"] = area_averaged(image)[0].round().to(torch.uint8).numpy()
         owners = self._slots.owners(sim.visible_bodies(camera))
         row["mask"] = np.array([0, *(kind + 1 for kind in self._kinds)])[owners[np.ix_(self._cells, self._cells)] + 1]
         view = sim.model.camera(MJCF_CAMERAS[camera]).id

@@ -133,7 +133,7 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     return sorted(found)
 
 
-def spelled(path: Path) -> Path:
+def existing_spelling(path: Path) -> Path:
     """Return the path of a file, whose name may have other letter case on the disk."""
     names = os.listdir(path.parent) if not path.exists() and path.parent.is_dir() else []
     return path.with_name(next((name for name in sorted(names) if name.lower() == path.name.lower()), path.name))

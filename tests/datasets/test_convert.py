@@ -416,7 +416,7 @@ def test_archive_equals_its_folder(written, converted, tmp_path):
     ids=["while unpacking", "after inspection", "in the second file"],
 )
 def test_killed_conversion_continues(written, tmp_path, monkeypatch, holder, name, call, unpacked_again):
-    source, unpacked, inner = packed(written, tmp_path / "a.zip"), [], convert_module.unpack
+    source, unpacked, inner = packed(written, tmp_path / "a.zip"), [], convert_module.unpack_member
     killed_at(holder, name, call, lambda: convert(source, tmp_path / "ds"))
     assert not is_dataset(tmp_path / "ds")
     with pytest.raises(MemobenchError, match="convention='upright'"):

@@ -13,7 +13,7 @@ from safetensors.torch import save_file
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector, detections
-from lerobot_memobench.perception.visual_encoder import GRID, SIDE, resized
+from lerobot_memobench.perception.visual_encoder import GRID, SIDE, area_averaged
 from lerobot_memobench.perception.weights import load_detector, save_detector
 from research.detector.training import targets
 from tests.support.labelled_images import (
@@ -73,6 +73,6 @@ def test_uncertainties_are_of_the_image_and_of_metres() -> None:
 
 
 def test_pictures_are_square() -> None:
-    assert resized(torch.zeros(1, 3, 360, 360)).shape == (1, 3, SIDE, SIDE)
+    assert area_averaged(torch.zeros(1, 3, 360, 360)).shape == (1, 3, SIDE, SIDE)
     with pytest.raises(MemobenchError, match="found pictures of 320 x 256 pixels"):
-        resized(torch.zeros(1, 3, 320, SIDE))
+        area_averaged(torch.zeros(1, 3, 320, SIDE))

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cosine_similarity, gelu, layer_norm, rms_norm, silu
 
-from lerobot_memobench.policies.memobench_mem.memory import read_settings
+from lerobot_memobench.policies.memobench_mem.memory import mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.bank import Bank
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec, Query
 
@@ -21,7 +21,7 @@ D, P, STRIDE, LENGTH, FRAMES = 8, 2, 24, 3, 12
 def made(**changed: Any) -> Bank:
     torch.manual_seed(0)
     spec = MemorySpec(dim=D, tokens=P, width=6, expert=6, grid=0, stride=STRIDE)
-    return Bank(spec, torch.nn.Identity(), read_settings("bank", {"length": LENGTH, **changed})).eval()
+    return Bank(spec, torch.nn.Identity(), mechanism_settings("bank", {"length": LENGTH, **changed})).eval()
 
 
 def written(bank: Bank, frames: Tensor, stride: int = STRIDE) -> Any:

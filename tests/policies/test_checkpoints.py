@@ -31,7 +31,7 @@ from lerobot_memobench.policies import checkpoint
 from lerobot_memobench.policies.checkpoint import (
     check_as_trained,
     check_checkpoint,
-    check_statistics,
+    check_processor_statistics,
     check_weights,
     checkpoint_type,
     shipped_policies,
@@ -345,7 +345,7 @@ def test_damaged_files_end_in_a_result_or_an_error(tmp_path: Path, kind: str, co
         training_facts(damaged)
         check_checkpoint(str(damaged))
         checkpoint_type(str(damaged))
-        check_statistics(damaged)
+        check_processor_statistics(damaged)
         require_agreement(damaged, None, MemobenchMemConfig(device="cpu"), training=True)
 
     found = mutations.ends_well(range(count), prepare, use, whole, ("it",))

@@ -20,9 +20,9 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
     MemobenchMemConfig,
     UnreadError,
     conditions,
-    setting,
+    policy_setting,
 )
-from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
+from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.network import FUSIONS
 
 OBJECTS = {"size": "small", "perception": "objects"}
@@ -51,7 +51,7 @@ def test_defaults_of_each_memory() -> None:
     for name in OURS:
         made = config(memory=name)
         assert (made.memory_fusion == "own") == (find_mechanism(name).fusion is not None)
-        assert made.memory_settings == vars(read_settings(name, {}))
+        assert made.memory_settings == vars(mechanism_settings(name, {}))
     without = config(memory="none")
     assert (without.memory_fusion, without.memory_settings) == (None, {})
 
@@ -141,8 +141,8 @@ def test_settings_without_effect_are_refused(name: str, fields: dict[str, Any]) 
 
 @dataclasses.dataclass
 class OneMore(MemobenchMemConfig):
-    repetitions: int = setting(1, used_if=MEMORY, least=1)
-    colour: str = setting("grey", values=("grey", "red"))
+    repetitions: int = policy_setting(1, used_if=MEMORY, least=1)
+    colour: str = policy_setting("grey", values=("grey", "red"))
 
 
 def test_a_setting_is_one_field() -> None:
@@ -160,7 +160,7 @@ def test_default_settings_of_another_memory_are_replaced() -> None:
     """A checkpoint's settings are merged with those of the command."""
     had = config().memory_settings
     for name in set(OURS) - {"frames", "subgoal"}:  # these two have the same settings
-        assert config(memory=name, memory_settings=had).memory_settings == vars(read_settings(name, {}))
+        assert config(memory=name, memory_settings=had).memory_settings == vars(mechanism_settings(name, {}))
     kept = {"frames": 4, "content": False}
     assert config(memory="subgoal", memory_settings=kept).memory_settings == kept
     assert config(memory="bank", memory_settings={**kept, "length": 4}).memory_settings == {"length": 4}

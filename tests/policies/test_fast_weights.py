@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lerobot_memobench.policies.memobench_mem.memory import read_settings, recurrent
+from lerobot_memobench.policies.memobench_mem.memory import mechanism_settings, recurrent
 from lerobot_memobench.policies.memobench_mem.memory.fast_weights import (
     FRAMES_READ,
     HEADS,
@@ -26,7 +26,7 @@ SPEC = MemorySpec(dim=12, tokens=3, width=12, expert=16, grid=0, stride=16)
 def made(std: float = 0.5, **changed: Any) -> FastWeights:
     """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
-    mechanism = FastWeights(SPEC, torch.nn.Identity(), read_settings("fast_weights", changed)).double()
+    mechanism = FastWeights(SPEC, torch.nn.Identity(), mechanism_settings("fast_weights", changed)).double()
     for name, weight in mechanism.named_parameters():
         if name != "rate.bias":
             torch.nn.init.normal_(weight, std=std)
@@ -121,7 +121,9 @@ RECURRENT_SPEC = MemorySpec(dim=32, tokens=3, width=32, expert=16, grid=0, strid
 def made_recurrent(**changed: Any) -> recurrent.Recurrent:
     """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
-    mechanism = recurrent.Recurrent(RECURRENT_SPEC, torch.nn.Identity(), read_settings("recurrent", changed)).double()
+    mechanism = recurrent.Recurrent(
+        RECURRENT_SPEC, torch.nn.Identity(), mechanism_settings("recurrent", changed)
+    ).double()
     for weight in mechanism.parameters():
         torch.nn.init.normal_(weight, std=0.5)
     return mechanism

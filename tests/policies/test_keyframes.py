@@ -17,7 +17,7 @@ from lerobot_memobench.policies.memobench_mem.memory.keyframes import (
     SHOWN,
     Keyframes,
     representatives,
-    shown,
+    shown_keyframes,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories, Query
 from tests.policies.test_memory import made
@@ -73,7 +73,7 @@ def test_shown_keyframes_equal_those_of_an_unbounded_list() -> None:
     for number in range(400):
         tokens = torch.full((1, mechanism.spec.tokens, mechanism.spec.dim), float(number))
         window = max(0, number - RECENT + 1)
-        expected = shown(nominated, GAP, window)
+        expected = shown_keyframes(nominated, GAP, window)
         state = mechanism.write(state, tokens, torch.tensor([number * STRIDE]), ALL)
         assert mechanism.seen[-1] == expected, number  # type: ignore[index]
         recent = torch.arange(number - RECENT + 1, number + 1)

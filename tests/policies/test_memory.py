@@ -15,7 +15,7 @@ from transformers.initialization import no_init_weights
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import memory
-from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, read_settings
+from lerobot_memobench.policies.memobench_mem.memory import OURS, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.frames import (
     FrameSampling,
     MemoryEncoder,
@@ -40,7 +40,7 @@ def made(name: str, stride: int = 8, seed: int = 0, **changed: Any) -> MemoryMec
     pool = nn.Sequential(nn.Linear(6, P * D), nn.Unflatten(-1, (P, D)), nn.Flatten(1, 2))
     spec = MemorySpec(dim=D, tokens=P, width=16, expert=16, grid=0, stride=stride, subgoals=SUBGOALS)
     mechanism = find_mechanism(name)
-    return mechanism(spec, Moves() if mechanism.asks_motion else pool, read_settings(name, changed)).eval()
+    return mechanism(spec, Moves() if mechanism.asks_motion else pool, mechanism_settings(name, changed)).eval()
 
 
 class Moves(MotionField):

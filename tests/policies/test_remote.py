@@ -362,7 +362,7 @@ def test_frames_equal_those_of_openpis_client() -> None:
         "prompt": "say ä",
     }
     assert wire.pack(message).hex() == OPENPI_FRAME
-    back = wire.unpack(bytes.fromhex(OPENPI_FRAME))
+    back = wire.unpack_message(bytes.fromhex(OPENPI_FRAME))
     assert (back["n"], back["n"].dtype) == (1.5, np.float32)
     assert back["observation/image"].dtype == np.uint8
     assert np.array_equal(back["observation/image"], message["observation/image"])
@@ -373,7 +373,7 @@ def test_objects_are_neither_packed_nor_unpacked() -> None:
         wire.pack({"x": np.array([object()])})
     foreign = wire.pack({"x": np.zeros(1)}).replace(b"<f8", b"|O8")
     with pytest.raises(ValueError, match="object"):
-        wire.unpack(foreign)
+        wire.unpack_message(foreign)
 
 
 @pytest.mark.parametrize(

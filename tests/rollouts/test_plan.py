@@ -30,7 +30,7 @@ from lerobot_memobench.rollouts.plan import (
     plan_line,
     take_run_options,
 )
-from lerobot_memobench.rollouts.settings import settings_of
+from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 from tests.support.logs import card
@@ -110,7 +110,7 @@ def test_settings_are_typed_and_completed(
     plan = plan_line([*BARE, *words])
     assert {name: facts(plan)[name] for name in found} == found
     # The settings on a card make the same plan again.
-    asked = replace(settings_of(card_of(plan)), output_dir="out")
+    asked = replace(card_settings(card_of(plan)), output_dir="out")
     if "path" in asked.policy:
         asked = replace(asked, policy={**asked.policy, "path": str(plan.policy_path)})
     assert facts(make_plan(asked, plan.options, ())) == facts(plan)

@@ -27,10 +27,10 @@ from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
     differences_here,
-    plan_of,
+    plan_of_evaluation,
     read_repeatable,
 )
-from lerobot_memobench.rollouts.settings import EvaluationSettings, settings_of
+from lerobot_memobench.rollouts.settings import EvaluationSettings, card_settings
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
@@ -54,7 +54,7 @@ def card(settings: Any, **changes: Any) -> dict[str, Any]:
 
 
 def allowed(server: str | None = None, **settings: Any) -> EvaluationSettings:
-    return allowed_settings(settings_of(card(settings)), server)
+    return allowed_settings(card_settings(card(settings)), server)
 
 
 RANDOM = {"env": {"tasks": STOVE}, "policy": {"type": "memobench_random"}}
@@ -299,7 +299,7 @@ def command_lines(draw: st.DrawFn) -> list[str]:
 def test_a_card_makes_its_plan_again(line: list[str]) -> None:
     plan = plan_line([*line, "output_dir=out"])
     write_evaluation(Path(), card_of(plan))
-    again = plan_of(*read_repeatable(Path()), Path("out"))
+    again = plan_of_evaluation(*read_repeatable(Path()), Path("out"))
     assert again.settings.portable == plan.settings.portable
     assert (again.options, again.policy, again.environment) == (plan.options, plan.policy, plan.environment)
     assert (again.seed, again.batch, again.grid) == (plan.seed, plan.batch, plan.grid)

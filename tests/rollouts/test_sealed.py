@@ -20,8 +20,8 @@ from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import plan_line
-from lerobot_memobench.rollouts.rerun import plan_of
-from lerobot_memobench.rollouts.settings import settings_of
+from lerobot_memobench.rollouts.rerun import plan_of_evaluation
+from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.rollouts.shards import plan_shards
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.fake_loop import STOVE, FakeLoop
@@ -117,10 +117,10 @@ def test_resumed_and_repeated_runs_keep_the_salt(fake_loop: FakeLoop, capsys: py
     assert main([*COMMAND, "shard=1/2", "output_dir=b"]) == 2
     assert "shard=1/2 of a sealed test without salt=" in capsys.readouterr().err
     card = card_of(plan_line([*SEALED, "output_dir=c"]))
-    assert plan_of(card, settings_of(card), Path("d")).split == "sealed"
+    assert plan_of_evaluation(card, card_settings(card), Path("d")).split == "sealed"
     del card["protocol"]["salt"]
     with pytest.raises(MemobenchError, match="test-sealed"):
-        plan_of(card, settings_of(card), Path("d"))
+        plan_of_evaluation(card, card_settings(card), Path("d"))
 
 
 def test_parts_share_the_salt_and_merge(fake_loop: FakeLoop) -> None:

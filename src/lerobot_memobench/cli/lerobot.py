@@ -30,11 +30,11 @@ from lerobot_memobench.commands.command_line import (
     RUN_OPTIONS,
     SHORT_FORMS,
     TYPE,
+    as_command_line,
     check_names,
     is_of_benchmark,
     parse_words,
     read_words,
-    spelled,
     without,
 )
 from lerobot_memobench.commands.lerobot_commands import call_lerobot, lerobot_commands
@@ -183,7 +183,7 @@ def flags_of_other(words: Mapping[str, str]) -> list[str]:
             raise MemobenchError(f"{key}= belongs to the benchmark: name it with env=memobench")
     asked = read_words("eval", words)
     kept = {key: words[key] for key in words if key == CONFIG_FILE or key.endswith(f".{PACKAGES}")}
-    flags = [f"--{word}" for word in spelled({**kept, **asked.words})]
+    flags = [f"--{word}" for word in as_command_line({**kept, **asked.words})]
     if HELP in words:
         return ["--help", *flags]
     if asked.get(f"env.{TYPE}") is None and CONFIG_FILE not in words:

@@ -99,7 +99,7 @@ def parse_words(line: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def spelled(words: Mapping[str, Any]) -> list[str]:
+def as_command_line(words: Mapping[str, Any]) -> list[str]:
     """Return words as a command line."""
     return [f"{key}={value}" for key, value in words.items()]
 
@@ -177,12 +177,12 @@ class CommandSettings:
         Raises:
             MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
         """
-        return build(self.config, self.settings)
+        return build_config(self.config, self.settings)
 
     def build_field(self, name: str) -> Any:
-        """Return the value of a field of the configuration, None where it is not given. Errors as of `build`."""
+        """Return the value of a field of the configuration, None where it is not given. Errors as of `build_config`."""
         given = self.settings.get(name)
-        return None if given is None else build(field_types(self.config)[name], given, name)
+        return None if given is None else build_config(field_types(self.config)[name], given, name)
 
 
 def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
@@ -472,7 +472,7 @@ NULLS = ("null", "~")
 """Texts that stand for no value, as in YAML; for a number or a truth value also ``none``."""
 
 
-def build(annotation: Any, given: Any, key: str = "") -> Any:
+def build_config(annotation: Any, given: Any, key: str = "") -> Any:
     """Return the configuration of a class with these settings, or the value of a field.
 
     Args:
@@ -638,7 +638,7 @@ def policy_config(asked: CommandSettings) -> PreTrainedConfig | None:
     """Return the configuration of the policy, None without one.
 
     Raises:
-        MemobenchError: the checkpoint is not complete, or as of `build`.
+        MemobenchError: the checkpoint is not complete, or as of `build_config`.
     """
     if (path := asked.get(f"policy.{PATH}")) is not None:
         check_checkpoint(path)

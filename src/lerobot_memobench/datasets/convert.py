@@ -220,7 +220,7 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
     return sorted(chosen, key=lambda entry: entry.filename)
 
 
-def unpack(archive: Path, file: SourceFile) -> None:
+def unpack_member(archive: Path, file: SourceFile) -> None:
     """Write a file of an archive to its path, or raise `Unusable`."""
     assert file.member is not None
     file.path.parent.mkdir(parents=True, exist_ok=True)
@@ -347,7 +347,7 @@ class _Conversion:
                 "make room, then repeat the command to continue"
             )
         try:
-            unpack(self.source, file)
+            unpack_member(self.source, file)
         except Unusable as error:
             if findings is not None:  # an earlier run found its demonstrations
                 raise MemobenchError(f"{self.source}, {file.name}: {error}") from None

@@ -36,7 +36,7 @@ from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
-from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, shown
+from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
 
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"
@@ -163,7 +163,7 @@ class EpisodeStage:
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
         """Add the next frame of both cameras, (H, W, 3) uint8 each, upright."""
         self._frames += 1
-        for name, image in shown(images, self._convention).items():
+        for name, image in in_convention(images, self._convention).items():
             self._videos[name].add(image)
             self._histograms[name].add(image)
 

@@ -117,7 +117,7 @@ class Policy(TypedDict, total=False):
     detector_sha256: str
 
 
-class Checkpoint(TypedDict):
+class ModelFiles(TypedDict):
     """Location of a policy's weights, and the hash of each file.
 
     Attributes:
@@ -191,7 +191,7 @@ class Card(TypedDict):
     protocol: Protocol
     policy: Policy
     written: NotRequired[str]
-    checkpoint: NotRequired[Checkpoint | None]
+    checkpoint: NotRequired[ModelFiles | None]
     trained_on: NotRequired[dict[str, Any] | None]
     task_files: NotRequired[dict[str, str]]
     settings: NotRequired[CardSettings]

@@ -23,7 +23,7 @@ from lerobot_memobench.constants import (
 from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.convention import shown
+from lerobot_memobench.sim.convention import in_convention
 from lerobot_memobench.sim.object_layout import BOUNDS, FIELDS, SIZE, SLOTS
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
@@ -237,7 +237,7 @@ class Observer:
         """Return the pictures and objects of the observation, see `observation_space`."""
         found: dict[str, Any] = {}
         if self._has_pictures:
-            found["pixels"] = shown(self._images, self._convention, self._mapping)
+            found["pixels"] = in_convention(self._images, self._convention, self._mapping)
         if self._has_objects:
             found["environment_state"] = self._objects.copy()  # may be returned again
         return found

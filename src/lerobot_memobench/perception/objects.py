@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from lerobot_memobench.perception.detector import Detections, Detector, detections
-from lerobot_memobench.perception.visual_encoder import resized
+from lerobot_memobench.perception.visual_encoder import area_averaged
 from lerobot_memobench.sim.asset import (
     AGENTVIEW_ANGLE,
     AGENTVIEW_POSITION,
@@ -163,7 +163,7 @@ class ObjectLocalizer:
             images: of each camera, (N, 3, H, H) in [0, 1].
             states: (N, >= 6) the hand's position, m, and its rotation as axis times angle, rad.
         """
-        both = torch.cat([resized(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
+        both = torch.cat([area_averaged(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
         found = detections(self.detector(both))
         hands = states.cpu().numpy().astype(np.float64)
         slots = []

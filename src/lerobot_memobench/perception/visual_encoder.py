@@ -20,7 +20,7 @@ WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 """Channels of each stage, which halves the image, and its residual blocks."""
 
 
-def resized(images: Tensor) -> Tensor:
+def area_averaged(images: Tensor) -> Tensor:
     """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging.
 
     Raises:

@@ -172,7 +172,7 @@ def checkpoint_settings(path: str) -> dict[str, Any]:
         raise MemobenchError(f"the checkpoint folder {path} does not exist")
     if (file := checkpoint_file(path, CONFIG_FILE)) is None:
         raise MemobenchError(f"{path} holds no {CONFIG_FILE}; expected a complete checkpoint as lerobot-train saves it")
-    return read_json(file)
+    return read_checkpoint_json(file)
 
 
 def checkpoint_type(path: str) -> str:
@@ -186,7 +186,7 @@ def checkpoint_type(path: str) -> str:
     return name
 
 
-def read_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
+def read_checkpoint_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
     """Return the object in a JSON file of a checkpoint; raise `MemobenchError` if it is missing, or not of a schema."""
     try:
         content: dict[str, Any] = read_json_file(path, schema, ADVICE)
@@ -206,11 +206,11 @@ def check_checkpoint(path: str) -> None:
             raise MemobenchError(f"the checkpoint {folder} holds no weights ({WEIGHTS_FILE}); copy or train it again")
         for weights in folder.glob("*.safetensors"):
             check_fetched(weights)
-        check_statistics(folder)
+        check_processor_statistics(folder)
     check_processors(path)
 
 
-def check_statistics(source: str | Path, revision: str | None = None) -> None:
+def check_processor_statistics(source: str | Path, revision: str | None = None) -> None:
     """Refuse processors without the statistics of the training data.
 
     Their policy would run on raw numbers and score 0 % without any message.
@@ -222,7 +222,7 @@ def check_statistics(source: str | Path, revision: str | None = None) -> None:
                 f"{Path(source) / name} is missing; copy the checkpoint, or migrate one of an earlier LeRobot: "
                 f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {source}"
             )
-        for step in filter(_normalises, steps_of(file)):
+        for step in filter(_normalises, processor_steps(file)):
             state = step.get("state_file")
             known: dict[str, Any] = {}
             if state is not None:
@@ -259,10 +259,10 @@ def _normalised(step: SavedStep, processor: str) -> Iterator[str]:
 def check_processors(path: str | Path, revision: str | None = None) -> None:
     """Refuse processor steps that neither LeRobot nor this package nor an installed plugin registers; build none."""
     config = _file_of(path, CONFIG_FILE, revision)
-    kind = None if config is None else read_json(config).get("type")
+    kind = None if config is None else read_checkpoint_json(config).get("type")
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = _file_of(path, name, revision)
-        for step in steps_of(file):
+        for step in processor_steps(file):
             for reason in _reasons(step, kind):
                 raise MemobenchError(
                     f"{file} {reason}; expected steps with plain settings that LeRobot, this package or an installed "
@@ -393,11 +393,11 @@ def differing(
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:
     from safetensors import safe_open
 
-    with undamaged(file), safe_open(file, framework="numpy") as tensors:
+    with undamaged_tensors(file), safe_open(file, framework="numpy") as tensors:
         return {name: tuple(tensors.get_slice(name).get_shape()) for name in tensors.keys()}  # noqa: SIM118
 
 
-def undamaged(file: Path) -> AbstractContextManager[None]:
+def undamaged_tensors(file: Path) -> AbstractContextManager[None]:
     """As `refusing`, for reading the tensors of a checkpoint's file."""
     return refusing(lambda why: MemobenchError(f"{file} cannot be read ({why}); {ADVICE}"), file)
 
@@ -436,7 +436,7 @@ def statistics_shapes(source: str | Path) -> dict[str, tuple[int, ...]]:
     The configuration of a policy that began with another checkpoint may list that checkpoint's features instead.
     """
     file = _file_of(source, PREPROCESSOR_FILE)
-    names = [step.get("state_file") for step in filter(_normalises, steps_of(file))]
+    names = [step.get("state_file") for step in filter(_normalises, processor_steps(file))]
     states = [_file_of(source, file_name(name, f"state_file in {file}")) for name in names if name]
     shapes = {key: shape for state in states if state is not None for key, shape in _shapes(state).items()}
     columns = {key.rpartition(".")[0]: shape for key, shape in shapes.items() if not key.endswith(".count")}
@@ -448,7 +448,7 @@ def training_of(source: str | Path) -> dict[str, Any]:
     """Return the settings of a source's training (`TrainConfig`); {} if they are missing or not readable."""
     with suppress(MemobenchError):
         if (file := checkpoint_file(source, TRAIN_CONFIG)) is not None:
-            return read_json(file, TrainConfig)
+            return read_checkpoint_json(file, TrainConfig)
     return {}
 
 
@@ -457,13 +457,13 @@ def trained_names(source: str | Path) -> dict[str, str]:
     if rename_map := training_of(source).get("rename_map"):
         return dict(rename_map)
     file = _file_of(source, PREPROCESSOR_FILE)
-    configs = [step.get("config", {}) for step in steps_of(file) if step.get("registry_name") == RENAMING]
+    configs = [step.get("config", {}) for step in processor_steps(file) if step.get("registry_name") == RENAMING]
     return {old: new for config in configs for old, new in config.get("rename_map", {}).items()}
 
 
-def steps_of(file: Path | None) -> list[SavedStep]:
+def processor_steps(file: Path | None) -> list[SavedStep]:
     """Return the steps in the file of a processor; none without a file."""
-    steps: list[SavedStep] = [] if file is None else read_json(file, _Processor).get("steps", [])
+    steps: list[SavedStep] = [] if file is None else read_checkpoint_json(file, _Processor).get("steps", [])
     return steps
 
 

@@ -45,7 +45,7 @@ def quiet() -> Iterator[None]:
         logging.disable(level)
 
 
-def encoded(policy: Any) -> dict[str, Any]:
+def encoded_config(policy: Any) -> dict[str, Any]:
     """Return a policy's configuration as plain JSON values."""
     import draccus
 
@@ -56,7 +56,7 @@ def encoded(policy: Any) -> dict[str, Any]:
 
 def check_sizes(policy: Any) -> None:
     """Refuse a policy whose configuration has a length or a size that no machine can allocate."""
-    for name, value in _integers(encoded(policy)):
+    for name, value in _integers(encoded_config(policy)):
         most = LONGEST if name in LENGTHS else None if name.startswith("scheduler_") or "seed" in name else LARGEST
         if most is not None and value > most:
             raise MemobenchError(f"found policy.{name}={value}; expected at most {most}")
@@ -113,10 +113,10 @@ def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
 def identity_of(policy: Any, path: str | None, weights: str | None) -> str:
     """Return a policy's type and one hash over its checkpoint's hash and the settings that differ from it."""
     with quiet():
-        before = encoded(_default_config(policy, path))
+        before = encoded_config(_default_config(policy, path))
     changes = {
         key: file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
-        for key, value in encoded(policy).items()
+        for key, value in encoded_config(policy).items()
         if key not in (*ELSEWHERE, "type") and before.get(key) != value
     }
     facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)

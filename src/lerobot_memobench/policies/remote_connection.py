@@ -193,7 +193,7 @@ class Connection:
         if isinstance(frame, str):
             raise self._failed(frame)
         try:
-            return unpack(frame)
+            return unpack_message(frame)
         except ValueError as error:
             raise self._foreign(str(error)) from error
 
@@ -274,7 +274,7 @@ def _pack(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} cannot be sent")
 
 
-def unpack(data: bytes) -> Any:
+def unpack_message(data: bytes) -> Any:
     """Return the message in a frame of openpi or of vla-evaluation-harness; raise `ValueError` if it is none."""
     with refusing(lambda why: Malformed(f"it is not msgpack with arrays ({why})")):
         return msgpack.unpackb(data, object_hook=_unpack, max_array_len=LONGEST_LIST, max_map_len=LONGEST_LIST)

@@ -27,7 +27,13 @@ from lerobot_memobench.policies.checkpoint import (
     local_folder,
     portable_path,
 )
-from lerobot_memobench.policies.lerobot_config import ELSEWHERE, checkpoint_files, encoded, identity_of, tree_hash
+from lerobot_memobench.policies.lerobot_config import (
+    ELSEWHERE,
+    checkpoint_files,
+    encoded_config,
+    identity_of,
+    tree_hash,
+)
 from lerobot_memobench.rollouts.plan import EvaluationPlan
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
@@ -51,7 +57,7 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         "format": FORMAT,
         "written": dt.datetime.now(dt.UTC).isoformat(timespec="seconds"),
         "protocol": protocol,
-        POLICY: policy_facts(encoded(plan.policy), plan.seed),
+        POLICY: policy_facts(encoded_config(plan.policy), plan.seed),
         "checkpoint": None,
         "trained_on": None,
         "task_files": {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks},

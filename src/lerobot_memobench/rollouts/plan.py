@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lerobot_memobench.commands.command_line import RUN_OPTIONS, parse_words, spelled, value_of, without
+from lerobot_memobench.commands.command_line import RUN_OPTIONS, as_command_line, parse_words, value_of, without
 from lerobot_memobench.constants import (
     EVALUATION_EPISODES,
     EVALUATION_SEED,
@@ -128,7 +128,7 @@ class EvaluationPlan:
 def with_changes(line: Sequence[str], **changes: object) -> list[str]:
     """Return a command line in which these keys have other values; None removes one."""
     given = {key: str(value) for key, value in changes.items() if value is not None}
-    return spelled(without(parse_words(line), *changes) | given)
+    return as_command_line(without(parse_words(line), *changes) | given)
 
 
 # --- making it ---
@@ -144,7 +144,7 @@ def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
     from lerobot_memobench.rollouts.settings import read_settings
 
     options, others = take_run_options(words)
-    return make_plan(read_settings(others), options, ("lerobot", "eval", *spelled(words)))
+    return make_plan(read_settings(others), options, ("lerobot", "eval", *as_command_line(words)))
 
 
 def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:

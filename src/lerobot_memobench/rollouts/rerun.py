@@ -41,7 +41,7 @@ from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
 from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, settings_of
+from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds."""
@@ -79,7 +79,7 @@ def repeat(
     check_policy(card, settings.policy_path)
     for note in differences_here(card):
         say(f"note: {note}")
-    plan = plan_of(card, settings, out)
+    plan = plan_of_evaluation(card, settings, out)
     here = plan.environment.settings.protocol_block
     if found := differences(card["protocol"], here):
         start = card["runs"][-1]
@@ -112,10 +112,12 @@ def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, An
         MemobenchError: there is no card, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
-    return card, allowed_settings(settings_of(card), server)
+    return card, allowed_settings(card_settings(card), server)
 
 
-def plan_of(card: Mapping[str, Any], settings: EvaluationSettings, out: Path | None = None) -> EvaluationPlan:
+def plan_of_evaluation(
+    card: Mapping[str, Any], settings: EvaluationSettings, out: Path | None = None
+) -> EvaluationPlan:
     """Return the plan of a card's evaluation, to be run in ``out``, or in a folder of the present time."""
     out = out or Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_rerun"
     shard = None if card["shard"] is None else Shard.parse(card["shard"])

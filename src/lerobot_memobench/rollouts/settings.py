@@ -13,7 +13,7 @@ from lerobot.configs.eval import EvalPipelineConfig
 
 from lerobot_memobench.commands.command_line import (
     TYPE,
-    build,
+    build_config,
     chosen_class,
     field_types,
     given_values,
@@ -79,7 +79,7 @@ class EvaluationSettings:
 
     @property
     def portable(self) -> dict[str, Any]:
-        """The settings for the card, as far as its protocol does not hold them; `settings_of` reads them back.
+        """The settings for the card, as far as its protocol does not hold them; `card_settings` reads them back.
 
         They leave out the folders that are written. The package's own policies go by name, other paths are absolute.
         """
@@ -94,7 +94,7 @@ class EvaluationSettings:
         return {"env": env, "policy": policy, **loop, "rename_map": dict(self.rename_map)}
 
 
-def settings_of(card: Mapping[str, Any]) -> EvaluationSettings:
+def card_settings(card: Mapping[str, Any]) -> EvaluationSettings:
     """Return the settings of a card, see `EvaluationSettings.portable`; their values are not checked."""
     protocol, stored = card["protocol"], card["settings"]
     env = {name: protocol[name] for name in SETTINGS if name in protocol} | stored.get("env", {})
@@ -176,6 +176,6 @@ def policy_of(settings: EvaluationSettings) -> PreTrainedConfig:
     Raises:
         MemobenchError: the type is not known, or a value cannot be read. Others are the configuration's own.
     """
-    found: PreTrainedConfig = build(PreTrainedConfig, settings.policy, "policy")
+    found: PreTrainedConfig = build_config(PreTrainedConfig, settings.policy, "policy")
     found.pretrained_path = None  # it does not depend on the place of the checkpoint
     return found

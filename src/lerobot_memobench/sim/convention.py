@@ -29,7 +29,7 @@ def picture_names(convention: str, mapping: Mapping[str, str] | None = None) -> 
     return {camera: given.get(LIBERO_CAMERAS[camera], name) for camera, name in CONVENTIONS[convention].items()}
 
 
-def shown(
+def in_convention(
     pictures: Mapping[str, NDArray[np.uint8]], convention: str, mapping: Mapping[str, str] | None = None
 ) -> dict[str, NDArray[np.uint8]]:
     """Return each camera's upright picture (H, W, 3) by the name and in the orientation of a convention, as a copy."""

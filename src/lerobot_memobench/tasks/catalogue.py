@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.io import files_below, refusing, spelled
+from lerobot_memobench.io import existing_spelling, files_below, refusing
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
@@ -301,7 +301,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
         return get_libero_task(folder.name)
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
-    bddl, path = spelled(folder / BDDL_FILE), spelled(folder / METADATA_FILE)
+    bddl, path = existing_spelling(folder / BDDL_FILE), existing_spelling(folder / METADATA_FILE)
     expected = "expected the scene, instruction and goal in BDDL"
     with refusing(lambda why: MemobenchError(f"{bddl} cannot be read ({why}), {expected}"), bddl):
         text = bddl.read_text(encoding="utf-8-sig")

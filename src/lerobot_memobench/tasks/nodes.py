@@ -29,11 +29,11 @@ Read = Callable[[Atom], bool]
 """Returns the value of an atom in the present step, including latched atoms."""
 
 
-def build(formula: Formula, hold_steps: int) -> _Node:
+def build_tree(formula: Formula, hold_steps: int) -> _Node:
     """Return the evaluation tree of a formula; ``hold_steps``: steps for which each child of `Then` has to hold."""
     if isinstance(formula, Atom):
         return _AtomNode(formula)
-    parts = [build(child, hold_steps) for child in children(formula)]
+    parts = [build_tree(child, hold_steps) for child in children(formula)]
     number = hold_steps if isinstance(formula, Then) else formula.number if isinstance(formula, Counted) else 0
     return _NODES[type(formula)](parts, number)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from lerobot_memobench.tasks.formula import LATCHES, And, Atom, Formula, Round, When, atoms, children, walk
-from lerobot_memobench.tasks.nodes import build
+from lerobot_memobench.tasks.nodes import build_tree
 from lerobot_memobench.tasks.task import Task
 
 #: Consecutive evaluations for which a child of ``Then`` must hold before it is done. There is one evaluation per
@@ -28,7 +28,7 @@ class Evaluator:
 
     def __init__(self, formulas: Iterable[Formula], hold_steps: int = HOLD_STEPS) -> None:
         self.formulas = tuple(formulas)
-        self._nodes = [build(formula, hold_steps) for formula in self.formulas]
+        self._nodes = [build_tree(formula, hold_steps) for formula in self.formulas]
         self._remembering = [node for root in self._nodes for node in root.walk() if node.memory]
         latches = {atom for formula in self.formulas for atom in atoms(formula) if atom.predicate in LATCHES}
         self._sources = {atom: Atom(LATCHES[atom.predicate], atom.args) for atom in sorted(latches, key=str)}

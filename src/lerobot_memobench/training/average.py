@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import as_trained, checkpoint_file, undamaged
+from lerobot_memobench.policies.checkpoint import as_trained, checkpoint_file, undamaged_tensors
 from lerobot_memobench.policies.memobench_mem.checkpoints import read_tensors, restarted
 
 logger = logging.getLogger(__name__)
@@ -87,7 +87,7 @@ class WeightAverage:
         Raises:
             MemobenchError: the file cannot be read, or does not fit.
         """
-        with undamaged(path), safe_open(path, framework="pt") as file:
+        with undamaged_tensors(path), safe_open(path, framework="pt") as file:
             metadata = file.metadata()
         tensors: Mapping[str, Tensor] = read_tensors(path)
         found = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}

@@ -20,9 +20,9 @@ from lerobot_memobench.commands.command_line import (
     TRAINING_OPTIONS,
     TYPE,
     CommandSettings,
+    as_command_line,
     read_words,
     resolve_recipe,
-    spelled,
     value_of,
     without,
 )
@@ -50,7 +50,7 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     local_folder,
     looks_local,
-    read_json,
+    read_checkpoint_json,
     text_of_link,
 )
 from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
@@ -89,7 +89,7 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
     prompt_frames, obs_type, rest = take_training_options(resolve_recipe(with_last_checkpoint(words)))
     asked = read_words("train", rest)
     if HELP in words:
-        return call_lerobot("train", ["--help", *(f"--{word}" for word in spelled(asked.words))])
+        return call_lerobot("train", ["--help", *(f"--{word}" for word in as_command_line(asked.words))])
     config = complete_training(asked, notify)
     if config.checkpoint_path is not None:
         done = step_reached(config.checkpoint_path)
@@ -228,7 +228,7 @@ def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
     if memory is None:
         return asked
     folder = None if path is None else local_folder(path)
-    begun = read_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
+    begun = read_checkpoint_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
     if begun.get("type") != MEMORY_POLICY:
         return asked
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig, memory_defaults
@@ -311,11 +311,11 @@ def check_dataset(asked: CommandSettings) -> None:
 
 def check_memory_settings(asked: CommandSettings, policy: Any) -> None:
     """Refuse settings on the command line that belong to another memory; a checkpoint's may."""
-    from lerobot_memobench.policies.memobench_mem.memory import NONE, read_settings
+    from lerobot_memobench.policies.memobench_mem.memory import NONE, mechanism_settings
 
     given = asked.words.get("policy.memory_settings")
     if given and getattr(policy, "memory", NONE) != NONE:
-        read_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], given))
+        mechanism_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], given))
 
 
 # -- resumed trainings -------------------------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
         raise MemobenchError("resume=true needs the folder of the training: output_dir=<folder>")
     checkpoint = last_checkpoint(Path(folder).expanduser())
     checkpoint_type(str(checkpoint))
-    begun = (read_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
+    begun = (read_checkpoint_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
     kind = named = words.get("policy") or words.get(f"policy.{TYPE}")
     if named is not None and (source := checkpoint_folder(named)) is not None:
         kind = checkpoint_type(str(source))
@@ -381,7 +381,7 @@ def complete_checkpoints(run: Path) -> Iterator[Path]:
 
 def step_reached(checkpoint: Path) -> int:
     """Return the step at which a checkpoint was saved."""
-    return int(read_json(checkpoint / TRAINING_STEP)["step"])
+    return int(read_checkpoint_json(checkpoint / TRAINING_STEP)["step"])
 
 
 def make_room_for_link(last: Path) -> None:
@@ -475,7 +475,7 @@ def resume_hint(config: TrainPipelineConfig, words: Mapping[str, str]) -> str:
     """Return the advice for a training that was terminated: the command that resumes from its last checkpoint."""
     assert config.output_dir is not None
     if not any(complete_checkpoints(config.output_dir)):
-        return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *spelled(words)])}"
+        return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *as_command_line(words)])}"
     kept = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
-    again = spelled({"output_dir": str(config.output_dir), "resume": "true", **kept})
+    again = as_command_line({"output_dir": str(config.output_dir), "resume": "true", **kept})
     return f"go on with: {shlex.join(['lerobot', 'train', *again])}"

@@ -32,7 +32,7 @@ from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
 from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
-from lerobot_memobench.policies.checkpoint import undamaged
+from lerobot_memobench.policies.checkpoint import undamaged_tensors
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
@@ -88,7 +88,7 @@ class EpisodeFeatures:
         """Return the features (n, P, D) bfloat16 of an episode's stored frames."""
         if number not in self._opened:
             path = episode_file(self.folder, number)
-            with undamaged(path), safe_open(path, framework="pt") as file:
+            with undamaged_tensors(path), safe_open(path, framework="pt") as file:
                 self._opened[number] = file.get_tensor(TOKENS)
         return self._opened[number]
 

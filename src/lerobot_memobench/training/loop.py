@@ -44,7 +44,7 @@ from lerobot.utils.utils import cycle, init_logging, inside_slurm
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import read_json
+from lerobot_memobench.policies.checkpoint import read_checkpoint_json
 from lerobot_memobench.training.average import WeightAverage, begin_average
 from lerobot_memobench.training.data import Training, check_environment, open_datasets, open_training
 from lerobot_memobench.training.sampler import FrameSampler, seed_of, task_weights
@@ -352,7 +352,7 @@ def load_state(checkpoint: Path, optimizer: Any, scheduler: Any) -> dict[str, in
     The random state is not restored: each update sets its own (`train`).
     """
     folder = checkpoint / TRAINING_STATE_DIR
-    progress = read_json(folder / TRAINING_STEP)
+    progress = read_checkpoint_json(folder / TRAINING_STEP)
     load_optimizer_state(optimizer, folder)
     if scheduler is not None:
         load_scheduler_state(scheduler, folder)

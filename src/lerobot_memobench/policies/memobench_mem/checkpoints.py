@@ -21,8 +21,8 @@ from lerobot_memobench.policies.checkpoint import (
     check_processors,
     checkpoint_file,
     differing,
-    steps_of,
-    undamaged,
+    processor_steps,
+    undamaged_tensors,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
@@ -120,14 +120,14 @@ def weights_file(source: str | Path, revision: str | None = None) -> Path:
 
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Return all tensors of a file; a `MemobenchError` if it is truncated or damaged."""
-    with undamaged(path):
+    with undamaged_tensors(path):
         return load_file(path)
 
 
 def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
     """Return the weights whose names start with ``prefix``, without a leading ``model.`` and the prefix."""
     path = weights_file(source)
-    with undamaged(path), safe_open(path, framework="pt") as tensors:
+    with undamaged_tensors(path), safe_open(path, framework="pt") as tensors:
         weights = {}
         for name in tensors.keys():  # noqa: SIM118 (not a dict)
             short = name.removeprefix("model.")
@@ -170,7 +170,7 @@ def require_agreement(source: str | Path, revision: str | None, config: Memobenc
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
         return
-    steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in steps_of(path)}
+    steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in processor_steps(path)}
     tokenizer, held = steps.get("memobench_tokenizer"), dict[str, Any]()
     if not training:
         held["oracle_memory"] = steps.get("memobench_oracle_memory", {}).get("enabled", False)

@@ -28,8 +28,8 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     OURS,
     find_mechanism,
     mechanism_names,
-    read_settings,
-    settings_of,
+    mechanism_settings,
+    setting_names,
     settings_of_another,
 )
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
@@ -90,7 +90,7 @@ TEXTS = Condition(
 FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
 
 
-def setting(
+def policy_setting(
     default: Any,
     *,
     used_if: Condition | None = None,
@@ -169,34 +169,34 @@ class MemobenchMemConfig(PreTrainedConfig):
     reads_prompt: ClassVar[bool] = True
     execution_only: ClassVar[bool] = True
 
-    size: str = setting("tiny", values=SIZES)
+    size: str = policy_setting("tiny", values=SIZES)
     """``small`` (learns from objects in minutes on a CPU), ``tiny`` (trains on a CPU) or ``pi05`` (3.2 B weights)."""
 
     # -- observations
-    perception: str = setting("pixels", values=PERCEPTIONS)
+    perception: str = policy_setting("pixels", values=PERCEPTIONS)
     """Source of observation tokens: ``pixels``, encoded by a frozen network, or ``objects``, the slots of
     ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
-    detector: str | None = setting(None, used_if=OBJECTS)
+    detector: str | None = policy_setting(None, used_if=OBJECTS)
     """With ``perception=objects``: detect objects in pictures by this detector, instead of reading privileged object
     state. ``package``, or a file of `python -m research.detector train`. A checkpoint holds only its name."""
-    visual_encoder: str | None = setting(None, used_if=VISUAL_ENCODER)
+    visual_encoder: str | None = policy_setting(None, used_if=VISUAL_ENCODER)
     """With pixels at ``size=small``: the frozen encoder of pictures, of ``package`` (the default) or of a detector's
     file. A checkpoint holds its weights."""
-    detection_noise: float = setting(0.0, used_if=OBJECTS, least=0)
+    detection_noise: float = policy_setting(0.0, used_if=OBJECTS, least=0)
     """Size of the errors added to privileged object state in training, so that the policy later acts by a
     ``detector``. 1: as large as the errors of the package's detector; 0: none."""
-    object_classes: list[str] | None = setting(None, used_if=OBJECTS)
+    object_classes: list[str] | None = policy_setting(None, used_if=OBJECTS)
     """Names of the object classes in order of their indices; None: the classes of this version."""
 
-    n_obs_steps: int = setting(1, least=1, most=1)
+    n_obs_steps: int = policy_setting(1, least=1, most=1)
     """Always 1: earlier frames are read through the memory."""
-    max_state_dim: int = setting(32, used_if=STATE_TOKEN)
+    max_state_dim: int = policy_setting(32, used_if=STATE_TOKEN)
     """Numbers of a state, padded; raised to the dataset's, unless weights are loaded."""
 
     # -- network
     base_weights: str | None = None
     """Folder or repository of pi0.5 weights to start from (e.g. ``lerobot/pi05_base``); None: from scratch."""
-    dtype: str = setting("float32", values=("float32", "bfloat16"))
+    dtype: str = policy_setting("float32", values=("float32", "bfloat16"))
     """Precision of LeRobot's transformers: ``float32`` or ``bfloat16``."""
     tokenizer_name: str | None = None
     """``words``, or a Hugging Face tokenizer; None: that of the size."""
@@ -207,25 +207,25 @@ class MemobenchMemConfig(PreTrainedConfig):
     # -- actions
     chunk_size: int = FROM_SIZE
     """Actions of a chunk; None: 16 at ``small``, else 50."""
-    n_action_steps: int = setting(FROM_SIZE, least=1)
+    n_action_steps: int = policy_setting(FROM_SIZE, least=1)
     """Actions executed of a chunk before the next one is planned; None: 6 at ``small``, else 50. A policy of objects
     executes the chunk's following actions if its hand has stalled (`rollout.EnvMemory.begin_chunk`)."""
     max_action_dim: int = 32
     """Numbers of an action, padded; raised to the dataset's, unless weights are loaded."""
-    num_inference_steps: int = setting(10, used_if=FLOW, least=1)
+    num_inference_steps: int = policy_setting(10, used_if=FLOW, least=1)
     """Steps from noise to actions, with flow matching."""
 
     # -- alignment
-    align: str = setting("none", values=ALIGN_WEIGHTS)
+    align: str = policy_setting("none", values=ALIGN_WEIGHTS)
     """How memory is aligned with checkpoint language: ``none``, ``semantic``, ``contrastive`` or ``framewise``."""
-    subgoal_level: str = setting("intermediate", used_if=TEXTS, values=SUBGOAL_LEVELS)
+    subgoal_level: str = policy_setting("intermediate", used_if=TEXTS, values=SUBGOAL_LEVELS)
     """Level of the checkpoint language: ``coarse``, ``intermediate`` or ``fine``."""
-    align_targets: str = setting(SUBGOALS, used_if=ALIGNMENT, values=ALIGN_TARGETS)
+    align_targets: str = policy_setting(SUBGOALS, used_if=ALIGNMENT, values=ALIGN_TARGETS)
     """Texts that memory is aligned with: ``subgoals``, or a control. ``shuffled`` (the paper's) permutes them within
     each episode; an episode with fewer than three takes texts of other episodes; the permutation is the same in every
     epoch and on every machine. ``progress`` cuts the words that differ between the episodes of a task, and with them
     the hidden answer. ``answers`` is one text per episode, all its subgoals, which does not name its progress."""
-    text_encoder: str | None = setting(None, used_if=ALIGNMENT)
+    text_encoder: str | None = policy_setting(None, used_if=ALIGNMENT)
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
 
@@ -233,40 +233,40 @@ class MemobenchMemConfig(PreTrainedConfig):
     memory: str = "frames"
     """The memory mechanism: ``frames``, another one of `memory` or of an installed package, or ``none``: plain pi0.5,
     the baseline without a memory."""
-    memory_settings: dict[str, Any] = setting(dict, used_if=MEMORY)
+    memory_settings: dict[str, Any] = policy_setting(dict, used_if=MEMORY)
     """Settings of the mechanism (the ``Settings`` of its class); a setting that is not given has its default."""
-    memory_fusion: str | None = setting(FROM_SIZE, used_if=MEMORY, values=MEMORY_FUSIONS)
+    memory_fusion: str | None = policy_setting(FROM_SIZE, used_if=MEMORY, values=MEMORY_FUSIONS)
     """How actions read memory: ``modulation``, ``context`` (memory joins the prefix) or ``own`` (the mechanism's own
     way). None: ``own`` if the mechanism has one, else ``modulation``."""
-    subgoals: dict[str, list[str]] | None = setting(None, used_if=TEXT_MEMORY)
+    subgoals: dict[str, list[str]] | None = policy_setting(None, used_if=TEXT_MEMORY)
     """Instruction -> texts of its checkpoints, for a memory that learns from texts; None: those of the dataset."""
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text in the prompt, from the dataset's column ``memory`` in training
     and from the environment (``--env.oracle_memory=true``) in evaluation."""
-    memory_camera: str | None = setting(None, used_if=PICTURES)
+    memory_camera: str | None = policy_setting(None, used_if=PICTURES)
     """Camera whose pictures are remembered; None: the first of the policy's."""
-    memory_stride: int = setting(FROM_SIZE, used_if=MEMORY, least=1)
+    memory_stride: int = policy_setting(FROM_SIZE, used_if=MEMORY, least=1)
     """Control steps between remembered frames; None: the mechanism's, or 8 if training decodes no video (objects, or
     pixels through a visual encoder), else 1."""
-    memory_phase: bool = setting(False, used_if=OBJECT_MEMORY)
+    memory_phase: bool = policy_setting(False, used_if=OBJECT_MEMORY)
     """Whether a remembered frame of objects records its phase, prompt or execution. A memory with this information can
     count the steps since the execution began, which strict tasks hide."""
 
     # -- training
-    objective: str = setting(FROM_SIZE, values=OBJECTIVES)
+    objective: str = policy_setting(FROM_SIZE, values=OBJECTIVES)
     """How actions are learned: ``flow_matching``, as in pi0.5, or ``regression``, which computes a chunk in one pass
     instead of ten (`losses`). None: ``regression`` at ``small``, else ``flow_matching``."""
-    ema_decay: float = setting(FROM_SIZE, least=0, most=math.nextafter(1, 0))
+    ema_decay: float = policy_setting(FROM_SIZE, least=0, most=math.nextafter(1, 0))
     """Decay of the moving average of the weights, which evaluation uses; 0: no average. None: the paper's 0.999, or
     0.995 at ``small``."""
-    frames_per_episode: int = setting(FROM_SIZE, least=1)
+    frames_per_episode: int = policy_setting(FROM_SIZE, least=1)
     """Frames per episode in a batch; they share memory. ``batch_size`` counts frames. None: 6 if training decodes no
     video, else 1, as in LeRobot."""
     task_weights: dict[str, float] | None = field(default_factory=dict)
     """Draw tasks in proportion to these weights, independent of the length of their episodes. A key is a task's name, a
     memory type or ``prompted`` (tasks with a demonstration prompt); the first match counts, and other tasks weigh 1.
     None: all frames alike, which is the default if training decodes video; ``{}``, the default, else: all tasks."""
-    warmup_fraction: float = setting(0.05, least=0, most=1)
+    warmup_fraction: float = policy_setting(0.05, least=0, most=1)
     """Share of the updates in which the learning rate rises. It then stays constant, or falls as a cosine to 0.02 of
     its maximum at ``size=small``."""
 
@@ -355,7 +355,7 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     def _complete_memory(self) -> None:
         if self.memory == NONE:
-            if self.memory_settings in [asdict(read_settings(one, {})) for one in OURS if self.memory_settings]:
+            if self.memory_settings in [asdict(mechanism_settings(one, {})) for one in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
             return
         mechanism = find_mechanism(self.memory)
@@ -369,9 +369,9 @@ class MemobenchMemConfig(PreTrainedConfig):
         other = settings_of_another(self.memory, self.memory_settings)
         if other is not None:  # a checkpoint with another memory, from which training starts
             logger.warning("memory_settings are those of memory=%s; memory=%s keeps its own", other, self.memory)
-            own = settings_of(self.memory)
+            own = setting_names(self.memory)
             self.memory_settings = {name: value for name, value in self.memory_settings.items() if name in own}
-        self.memory_settings = asdict(read_settings(self.memory, self.memory_settings))
+        self.memory_settings = asdict(mechanism_settings(self.memory, self.memory_settings))
         if self.memory_stride is None:
             stride = mechanism.stride
             self.memory_stride = stride.get(self.perception) if isinstance(stride, Mapping) else stride

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, rms_norm
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, resized
+from lerobot_memobench.perception.visual_encoder import GRID, POOLED, SIDE, WIDTH, VisualEncoder, area_averaged
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
 
@@ -264,7 +264,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
         device = self.tower.grid_position.device
         with torch.autocast(device.type, enabled=False):  # mixed precision would differ from the cache
-            tokens: Tensor = self.tower(resized(pictures.to(device)))
+            tokens: Tensor = self.tower(area_averaged(pictures.to(device)))
         return tokens.to(torch.bfloat16)
 
     @torch.no_grad()

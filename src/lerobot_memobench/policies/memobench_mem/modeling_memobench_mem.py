@@ -24,7 +24,12 @@ from lerobot_memobench.constants import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_statistics, check_weights
+from lerobot_memobench.policies.checkpoint import (
+    as_trained,
+    check_as_trained,
+    check_processor_statistics,
+    check_weights,
+)
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,
@@ -453,7 +458,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         config = read_config(source, config, revision)
         path = weights_file(source, revision)
         if dataset_meta is None:
-            check_statistics(source, revision)
+            check_processor_statistics(source, revision)
         # With an adapter, ``source`` is the base; the processor steps are saved with the adapter.
         saved, of = (config.pretrained_path, config.pretrained_revision) if config.use_peft else (source, revision)
         if saved is not None:

@@ -47,7 +47,7 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
     rotate,
     scaled_and_shifted,
 )
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
 from lerobot_memobench.policies.memobench_mem.sizes import Dimensions
@@ -256,7 +256,7 @@ def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) ->
         stride=config.memory_stride,
         subgoals=texts_of(config.subgoals or {}),
     )
-    settings = read_settings(config.memory, config.memory_settings)
+    settings = mechanism_settings(config.memory, config.memory_settings)
     return mechanism(spec, mechanism.make_pool(observations, spec), settings)
 
 

@@ -36,7 +36,7 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, read_settings
+from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     CHOICES,
@@ -174,7 +174,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             return
         self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
         if self.config.memory != NONE:
-            self._settings = read_settings(self.config.memory, self.config.memory_settings)
+            self._settings = mechanism_settings(self.config.memory, self.config.memory_settings)
 
     def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
         """Set the configuration and the frames of a training."""

@@ -75,28 +75,28 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
 
 def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:
     """Return another mechanism whose settings are all ``given`` and include those that this mechanism lacks."""
-    strange = set(given) - settings_of(name)
+    strange = set(given) - setting_names(name)
     if not strange:
         return None
     for other in mechanism_names():
         with suppress(MemobenchError):  # of a broken package
-            if strange <= settings_of(other) <= set(given):
+            if strange <= setting_names(other) <= set(given):
                 return other
     return None
 
 
-def settings_of(name: str) -> set[str]:
+def setting_names(name: str) -> set[str]:
     """Return the names of a mechanism's settings."""
     return {one.name for one in fields(find_mechanism(name).Settings)}
 
 
-def read_settings(name: str, given: Mapping[str, Any]) -> Any:
+def mechanism_settings(name: str, given: Mapping[str, Any]) -> Any:
     """Return the settings of a mechanism, with defaults for those that are not ``given``.
 
     Raises:
         MemobenchError: a setting is unknown, or has a wrong type or value.
     """
-    known = settings_of(name)
+    known = setting_names(name)
     for key in given:
         if key not in known:
             hint = nearest(key, known) if known else "it has no settings."

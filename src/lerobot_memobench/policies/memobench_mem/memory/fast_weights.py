@@ -17,7 +17,12 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Query,
     State,
 )
-from lerobot_memobench.policies.memobench_mem.memory.recurrent import HIDDEN, RecurrenceSettings, encoded, projection
+from lerobot_memobench.policies.memobench_mem.memory.recurrent import (
+    HIDDEN,
+    RecurrenceSettings,
+    encode_frame,
+    projection,
+)
 
 HEADS, FRAMES_READ = 2, 8
 BASE_RATE, MAX_RATE, MAX_STEP = 0.01, 0.1, 5.0
@@ -71,7 +76,7 @@ class FastWeights(MemoryMechanism):
 
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Take a gradient step on the frame, apply the weights to it, and drop the oldest frame's output."""
-        frame = encoded(self.encoder, tokens, step)
+        frame = encode_frame(self.encoder, tokens, step)
         asked, key, value = (
             norm(rearrange(linear(frame), "r p (h d) -> r h p d", h=HEADS))
             for norm, linear in (

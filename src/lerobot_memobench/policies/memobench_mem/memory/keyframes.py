@@ -43,7 +43,7 @@ def representatives(nominated: Sequence[int], gap: int) -> list[int]:
     return [median_low(cluster) for cluster in clusters]
 
 
-def shown(nominated: Sequence[int], gap: int, window: int) -> list[int]:
+def shown_keyframes(nominated: Sequence[int], gap: int, window: int) -> list[int]:
     """Return the keyframes to show: the last representatives before ``window``, the oldest recent frame."""
     return [frame for frame in representatives(nominated, gap)[-SHOWN:] if frame < window]
 
@@ -139,7 +139,7 @@ class Keyframes(MemoryMechanism):
         ):
             nominated = [step for step, count in zip(steps, counts, strict=True) for _ in range(count)]
             window = min(step for step in recent if step >= 0)
-            frames = [steps.index(step) for step in shown(nominated, GAP * self.spec.stride, window)]
+            frames = [steps.index(step) for step in shown_keyframes(nominated, GAP * self.spec.stride, window)]
             chosen[row, SHOWN - len(frames) :] = torch.tensor(frames, dtype=torch.int64)
         chosen = chosen.to(kept.device)
         return kept[torch.arange(len(kept), device=kept.device).unsqueeze(1), chosen.clamp(min=0)], chosen >= 0
@@ -187,7 +187,7 @@ class Keyframes(MemoryMechanism):
         chosen = torch.full((len(labels), SHOWN), -1)
         for row, (ended, count) in enumerate(zip(ends, counts.tolist(), strict=True)):
             window = max(count - RECENT, 0)
-            frames = torch.tensor(shown(ended.nonzero().flatten().tolist(), GAP, window), dtype=torch.int64)
+            frames = torch.tensor(shown_keyframes(ended.nonzero().flatten().tolist(), GAP, window), dtype=torch.int64)
             if self.training and len(frames):
                 moved = frames + torch.randint(-SHIFTED, SHIFTED + 1, frames.shape)
                 frames = moved.clamp(0, window - 1)[torch.rand(len(frames)) >= DROPPED]

@@ -83,7 +83,7 @@ class Recurrent(MemoryMechanism):
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Let the slots attend to the frame and to themselves."""
         slots: Tensor = state["slots"]
-        frame = encoded(self.encoder, tokens, step)
+        frame = encode_frame(self.encoder, tokens, step)
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
         both = self.pre_norm(torch.cat([frame, slots], dim=1))
         key, value = self.key_value(both).chunk(2, dim=-1)
@@ -107,7 +107,7 @@ def projection(inputs: int, outputs: int, std: float = 0.02) -> nn.Linear:
     return made
 
 
-def encoded(encoder: MemoryEncoder, tokens: Tensor, step: Tensor) -> Tensor:
+def encode_frame(encoder: MemoryEncoder, tokens: Tensor, step: Tensor) -> Tensor:
     """Encode a frame's tokens (R, P, D) with their places and its control step (R,): (R, P, d)."""
     made: Tensor = encoder(tokens.unsqueeze(1), step.unsqueeze(1)).squeeze(1)
     return made
