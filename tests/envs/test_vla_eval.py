@@ -246,7 +246,8 @@ def test_trained_memory_policy_by_three_ways(tmp_path: Path, monkeypatch: pytest
             by_lerobot(tmp_path / "remote", *remote, *words)
         config = configuration()
         config["benchmarks"][0] |= {"episodes_per_task": 1}
-        config["benchmarks"][0]["params"] |= {"tasks": tasks, "log_dir": str(tmp_path / "log")}
+        published = {"suite": "published", "replan_steps": 1, "tasks": tasks}  # the guide's are strict
+        config["benchmarks"][0]["params"] |= {**published, "log_dir": str(tmp_path / "log")}
         config["output_dir"] = str(tmp_path / "results")
         (tmp_path / "memobench.yaml").write_text(yaml.safe_dump(config))
         command = [str(Path(sys.executable).with_name("vla-eval")), "run", "--no-docker", "-c", "memobench.yaml"]
