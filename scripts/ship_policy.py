@@ -28,9 +28,9 @@ from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
-from lerobot_memobench.policies.lerobot_config import ELSEWHERE
+from lerobot_memobench.policies.lerobot_config import ELSEWHERE, encoded_config
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.rollouts.card import encoded, git, training_facts
+from lerobot_memobench.rollouts.card import git, training_facts
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
 
@@ -155,7 +155,7 @@ def place(folder: str | Path) -> str:
 
 def settings(policy: dict[str, Any], before: dict[str, Any] | None = None) -> list[str]:
     """Return the settings that differ from the defaults of the policy's size and perception, or from ``before``."""
-    usual = encoded(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
+    usual = encoded_config(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
     known = usual | (before or {})
     given = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
     return [
