@@ -20,7 +20,7 @@ from lerobot_memobench.envs.evaluation_file import Acting, differences, facts_of
 from lerobot_memobench.evaluation.comparison import ALLOWED
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import plan_line
-from lerobot_memobench.rollouts.settings import settings_of
+from lerobot_memobench.rollouts.settings import card_settings
 from tests.support.scripts import load_script
 
 line = ["env=memobench", "policy=memobench_random", "episodes=1", "tasks=1"]
@@ -33,7 +33,7 @@ write_episodes("log", [{"task": "a", "memory_type": "temporal", "episode": 0, "s
 print(json.dumps({
     "help": "dummy=\\n        a setting that nothing applies (default: 0)" in help_of("eval"),
     "reference": [row for row in load_script("docs_reference").environment_fields() if row[0] == "dummy"],
-    "card": [card["protocol"]["dummy"], settings_of(card).env["dummy"]],
+    "card": [card["protocol"]["dummy"], card_settings(card).env["dummy"]],
     "record": record["dummy"],
     "comparison": [*differences(one, other), "dummy" in ALLOWED],
 }))

@@ -421,7 +421,7 @@ def test_killed_conversion_continues(written, tmp_path, monkeypatch, holder, nam
     assert not is_dataset(tmp_path / "ds")
     with pytest.raises(MemobenchError, match="convention='upright'"):
         convert(source, tmp_path / "ds", convention="libero")
-    monkeypatch.setattr(convert_module, "unpack", lambda *args: unpacked.append(args) or inner(*args))
+    monkeypatch.setattr(convert_module, "unpack_member", lambda *args: unpacked.append(args) or inner(*args))
     assert convert(source, tmp_path / "ds").episodes == 4
     assert len(unpacked) == unpacked_again, "finished files are not unpacked again"
 
