@@ -65,7 +65,7 @@ PUBLIC = {
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
     "Errors": ("errors", "MemobenchError"),
-    "Constants": ("protocol", ""),
+    "Constants": ("constants", ""),
 }
 """Heading -> public module and its documented names; "" for all names."""
 
