@@ -147,12 +147,12 @@ class Placer:
         name, where = atom.args
         rectangles, base = self._room(atom, poses)
         alone = self._assets[name].kind == "fixture" or where in self._assets
-        others = {} if alone else poses
+        obstacles = {} if alone else poses
         known, z = self._files[name], base[2] - self._files[name].bottom
         for _ in range(MAX_DRAWS):
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             position = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
-            if all(_is_clear_of(known, position, self._files[other], others[other]) for other in others):
+            if all(_is_clear_of(known, position, self._files[obstacle], obstacles[obstacle]) for obstacle in obstacles):
                 return np.array([*position, *self._turn(name, where, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "

@@ -167,8 +167,8 @@ def scene_xml(task: Task, visuals: bool) -> str:
     arena = arena_of(task)
     _place_arm(world, arena)
     room = mjcf.arena(arena.file)
-    for place, element in enumerate(_room(room, arena, task)):
-        world.insert(place, element)
+    for index, element in enumerate(_room(room, arena, task)):
+        world.insert(index, element)
     classes: dict[str, mjcf.ClassFile] = {}
     for name, class_name in instances(task):
         classes[class_name] = known = mjcf.class_file(class_name, task.suite)
@@ -273,13 +273,13 @@ def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
     """Remove visual geoms, materials, lights and colours; MuJoCo's rays pass through transparent geoms."""
-    _remove(world, lambda one: one.tag == "light")
+    _remove(world, lambda element: element.tag == "light")
     _remove(world, mjcf.is_visual)
     for geom in world.iter("geom"):
         for name in ("material", "rgba"):
             geom.attrib.pop(name, None)
     used = {geom.get("mesh") for geom in world.iter("geom")}
-    _remove(assets, lambda one: one.tag != "mesh" or one.get("name") not in used)
+    _remove(assets, lambda element: element.tag != "mesh" or element.get("name") not in used)
 
 
 def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
@@ -397,14 +397,14 @@ def _add_spring(
     lever = 1.0 if articulation.kind == "drawer" else DETENT_LEVER
     reach = travel * lever
     dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * travel
-    point, place = _moving_point(joint, lever, dead_centre)
+    point, position = _moving_point(joint, lever, dead_centre)
     turn = Rotation.from_quat(joint.parent.quat, scalar_first=True)  # LIBERO's knob is turned by 90°
-    fixed = joint.parent.pos + turn.apply(place) + DETENT_OFFSET * reach * np.array([0.0, 0.0, 1.0])
+    fixed = joint.parent.pos + turn.apply(position) + DETENT_OFFSET * reach * np.array([0.0, 0.0, 1.0])
     ends = {"fixed": (fixture, fixed), "moving": (joint.parent, point)}
     tendon = spec.add_tendon(name=f"{joint.name}_detent", group=SITE_GROUP)
-    for end, (body, position) in ends.items():
+    for end, (body, offset) in ends.items():
         name = f"{joint.name}_detent_{end}"
-        body.add_site(name=name, pos=position.tolist(), size=[0.001] * 3, group=SITE_GROUP)
+        body.add_site(name=name, pos=offset.tolist(), size=[0.001] * 3, group=SITE_GROUP)
         tendon.wrap_site(name)
     closed = float(np.hypot(1.0, DETENT_OFFSET))
     pushes = (DETENT_SLACK - closed) / closed * reach * lever

@@ -294,8 +294,8 @@ class Simulation:
         self.restore(start)
         if arm_only:
             self._hidden.absent = absent
-            others = robot.OTHERS
-            self.data.qpos[others], self.data.qvel[others] = qpos[others], qvel[others]
+            rest = robot.OTHERS
+            self.data.qpos[rest], self.data.qvel[rest] = qpos[rest], qvel[rest]
             mujoco.mj_step1(self.model, self.data)
         else:
             self._start.mark_objects(self.absent)
@@ -483,8 +483,8 @@ class Simulation:
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""
-        one, other = self.data.qpos[robot.FINGERS]
-        return float(one - other)
+        first, second = self.data.qpos[robot.FINGERS]
+        return float(first - second)
 
     def gripper_command(self) -> float:
         """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""

@@ -136,11 +136,11 @@ class World:
     def _in(self, a: str, region: str) -> bool:
         """LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`."""
         self._index(a)
-        place, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
+        point, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
         half = np.abs(rotation @ size)
         low, high = position - half, position + half
         low[2] -= IN_SLACK
-        return bool(np.all(place > low) and np.all(place < high))
+        return bool(np.all(point > low) and np.all(point < high))
 
     def _on_object(self, a: str, b: str) -> bool:
         self._index(a)
