@@ -164,7 +164,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         With ``prompt_in=reset`` the prompt plays here, and the first observation is the first execution frame.
         """
         super().reset(seed=seed)
-        named = seed is not None  # a drawn seed is not used again
+        repeatable = seed is not None  # a drawn seed is not used again
         self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
@@ -176,7 +176,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._scene_seed in SPLITS[SEALED] and settings.salt is None:
             _warn_of_sealed_seeds()
         with self._ending_episode():
-            self.episode.reset(self._scene_seed, variant, keep_prompt=named)
+            self.episode.reset(self._scene_seed, variant, keep_prompt=repeatable)
             if settings.interference:
                 self._others = self._others or Interference(self._task, settings)
                 self._others.begin(self._scene_seed)

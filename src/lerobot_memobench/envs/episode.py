@@ -404,9 +404,12 @@ def _wrong_atoms(task: Task) -> Iterator[Atom]:
         for other in task.objects
         if other not in atom.args and task.objects[other] == task.objects.get(name)
     ]
-    others = [
-        atom for k in range(task.num_variants) for each in task.variant(k).checkpoints for atom in atoms(each.goal)
+    variant_atoms = [
+        atom
+        for k in range(task.num_variants)
+        for checkpoint in task.variant(k).checkpoints
+        for atom in atoms(checkpoint.goal)
     ]
-    for atom in dict.fromkeys([*siblings, *others]):
+    for atom in dict.fromkeys([*siblings, *variant_atoms]):
         if atom.predicate in ("on", "in") and atom not in own:
             yield atom

@@ -345,11 +345,12 @@ def _contradictions(record: Mapping[str, Any], own_tasks: bool) -> Iterator[str]
         **dict.fromkeys(("lost", "held_steps"), record.get("suite") == STRICT),
         **{"paused_steps": pauses, "corrupted": record.get("corrupt", INTACT) != INTACT},
     }
-    extra = [name for name, given in of_settings.items() if name in record and not given]
+    extra = [name for name, allowed in of_settings.items() if name in record and not allowed]
     yield from (f"{name}: absent and {record[name]}" for name in extra)
     if "not_run" not in record:
         needed = {"choice": evidence, "paused_steps": pauses}
-        yield from (f"{name}: recorded and absent" for name, given in needed.items() if given and name not in record)
+        absent = [name for name, required in needed.items() if required and name not in record]
+        yield from (f"{name}: recorded and absent" for name in absent)
     if suite_of(record["task"]) is not None and not own_tasks:
         memory_type = group_of(record["task"])
         if memory_type != record["memory_type"]:
@@ -370,11 +371,11 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
     files = _log_files(directory)
     if not files:
         raise _without_log(directory)
-    found: list[str] = []
+    faults: list[str] = []
     newest: dict[Key, tuple[float, dict[str, Any]]] = {}
     outcomes: dict[Key, set[bool]] = {}
     for file in files:
-        for line in _read_file(file, found):
+        for line in _read_file(file, faults):
             written = float(line.pop(WRITTEN_AT, 0.0))
             key = key_of(line)
             if "not_run" not in line:
@@ -383,15 +384,15 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
                 newest[key] = (written, line)
     twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
     if twice:
-        found.append(
+        faults.append(
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
             f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
         )
     if problems is not None:
-        problems += found
+        problems += faults
     else:
-        for problem in found:
-            logger.warning("%s", problem)
+        for fault in faults:
+            logger.warning("%s", fault)
     return [newest[key][1] for key in sorted(newest)]
 
 
@@ -414,11 +415,11 @@ def _without_log(directory: Path) -> MemobenchError:
 
 def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Return task -> its episodes that could not be run."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    by_task: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
         if "not_run" in record:
-            found.setdefault(record["task"], []).append(record)
-    return found
+            by_task.setdefault(record["task"], []).append(record)
+    return by_task
 
 
 def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:
