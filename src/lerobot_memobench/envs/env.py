@@ -412,11 +412,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     """End logged episodes at their first step with the logged outcome, without simulation.
 
     Batch size and rows stay the same, so the policy acts in the other rows as in an uninterrupted evaluation.
-    Observations of a skipped episode are blank.
-
-    Args:
-        make: makes a `MemobenchEnv`.
-        log_dir: folder of the log, read once, at the first reset.
+    Observations of a skipped episode are blank. The log is read once, at the first reset.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
@@ -447,7 +443,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
     def _records(self) -> dict[int, dict[str, Any]]:
-        """Return episode -> log line, for this environment's task."""
         if self._logged is None:
             lines = read_lines(self._log_dir) if has_log(self._log_dir) else []
             name = self.get_wrapper_attr("task")

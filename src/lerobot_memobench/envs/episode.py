@@ -368,10 +368,8 @@ def referent_of(task: Task, seed: int, salt: str | None = None) -> Task:
     """Return the variant of a task that the seed draws.
 
     Draws are balanced: from the first seed of a split (`constants.SPLITS`), each block of as many seeds as variants
-    contains every variant once, in random order. All variants are equally frequent and independent of the layout.
-
-    Args:
-        salt: of a sealed evaluation (`EnvSettings.salt`): another order of each block.
+    contains every variant once, in random order; ``salt`` (`EnvSettings.salt`) changes the order. All variants are
+    equally frequent and independent of the layout.
     """
     if task.num_variants == 1:
         return task

@@ -131,12 +131,7 @@ class EpisodeRecord(TypedDict):
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
-    """Return the log line of an episode, an `EpisodeRecord`.
-
-    Args:
-        number: number of the episode in its evaluation, from 0.
-        wall_s: duration of the episode, s.
-    """
+    """Return the log line of an episode, an `EpisodeRecord`; ``number``: its field ``episode``."""
     progress, task, fault, choice = episode.progress, episode.task, episode.fault, episode.choice
     failure = classify_failure(
         *(task, progress.first_step, episode.success, episode.drifted),
@@ -297,13 +292,9 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
 
 
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file; see `joined`.
+    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file.
 
-    Args:
-        problems: see `read_lines`.
-
-    Raises:
-        MemobenchError: see `read_lines` and `joined`; or there is no evaluation's file.
+    Arguments and errors as of `read_lines` and `joined`; also raises without an evaluation's file.
     """
     lines = read_lines(directory, problems)
     return joined(Path(directory), read_evaluation(Path(directory)), lines)

@@ -203,11 +203,9 @@ class Card(TypedDict):
 
 
 def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return the content of an evaluation's file.
+    """Return the content of an evaluation's file; ``place``: its folder, or the file.
 
-    Args:
-        place: folder of the evaluation, or a file.
-        whole: require everything that resuming and repeating need.
+    With ``whole``, require everything that resuming and repeating need.
 
     Raises:
         MemobenchError: the file is missing, incomplete, malformed or of another format.
@@ -275,9 +273,7 @@ def differences(
 
     A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`).
 
-    Args:
-        extent: whether tasks and number of episodes are compared.
-        ignore: settings that may differ.
+    ``extent``: whether tasks and number of episodes are compared.
     """
     left_out = {*ignore, POLICY, SCENE_HASHES, *(() if extent else EXTENT)}
     return _differing({name: value for name, value in a.items() if name not in left_out}, b)

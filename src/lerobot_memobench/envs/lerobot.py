@@ -260,9 +260,7 @@ class MemobenchEnvConfig(_WithSettings):
     def opener(self, policy: Any, by: Acting, log_dir: Path) -> Opener:
         """Return a function that opens the vector environment of a task for a policy.
 
-        Args:
-            policy: configuration of the policy; None if unknown.
-            by: description of the policy for the log.
+        ``policy``: its configuration, None if unknown. ``by``: its description for the log.
 
         Raises:
             MemobenchError: ``log_dir`` contains a log of another protocol.

@@ -38,14 +38,11 @@ SOURCES = ("tasks", "sim", "experts", "envs")
 class PromptPlayer:
     """Simulate a prompt step by step.
 
-    Args:
-        sim: running scene in the episode's initial state.
-        longest: maximum number of control steps.
-        file: cache file of the finished prompt; None for no file.
+    The scene of ``sim`` is in the episode's initial state. ``longest``: maximum number of control steps. ``file``:
+    cache file of the finished prompt, or None.
 
     Attributes:
-        over: whether the prompt has ended.
-        succeeded: whether the prompt succeeded, once it has ended.
+        over, succeeded: whether the prompt has ended, and then whether it succeeded.
         observed: whether frames before the end are read; if not, a restored prompt skips them.
     """
 

@@ -64,7 +64,6 @@ EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
 PICTURE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
-"""Form of a ``salt``."""
 INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""

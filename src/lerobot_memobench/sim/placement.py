@@ -66,9 +66,7 @@ class Placer:
     def place(self, seed: int, draw: int = 0) -> None:
         """Sample a placement of a seed and write it into model (fixtures) and data (objects, joints).
 
-        Args:
-            seed: seed of the scene.
-            draw: number of the scene; only 0 is LIBERO's.
+        Of the scenes of a seed, only ``draw`` 0 is LIBERO's.
 
         Raises:
             MemobenchError: a region has no free space for its object.

@@ -221,7 +221,6 @@ def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
 
 
 def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> None:
-    """Set sizes and positions of the table's board and legs."""
     x, y, half = (side / 2 for side in TABLE_SIZE)
     table.set("pos", mjcf.format_numbers((0, 0, TABLE_TOP - half)))
     leg = (TABLE_TOP - half) / 2

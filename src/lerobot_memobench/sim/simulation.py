@@ -182,7 +182,6 @@ class Simulation:
         again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
 
         Args:
-            seed: seed of the scene.
             settling: called with `holds` after each stabilisation step.
             state: initial state (state_dim,) of arm, objects and joints, as of `tasks.libero_suites`. The seed then
                 draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
@@ -320,11 +319,7 @@ class Simulation:
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
         """Set a recorded state for queries and rendering.
 
-        The previously set state counts as its predecessor (`StartState.mark_step`).
-
-        Args:
-            state: (state_dim,) as returned by `state()`.
-            fixture_poses: as returned by `fixture_poses()`; unchanged by default.
+        The previously set state counts as its predecessor (`StartState.mark_step`). Fixtures stay by default.
 
         Raises:
             MemobenchError: the state has another shape.
@@ -364,9 +359,7 @@ class Simulation:
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
         """Restore a snapshot of this simulation, bit for bit.
 
-        Args:
-            snapshot: state returned by `snapshot`.
-            replayed: whether the present state precedes the snapshot, as in the original episode.
+        ``replayed``: whether the present state precedes the snapshot, as in the original episode.
         """
         self._start.mark_step(goes_on=replayed and snapshot.goes_on)
         mujoco.mj_setState(self.model, self.data, snapshot.physics, self._full)
@@ -382,9 +375,7 @@ class Simulation:
         Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
         objects are absent until their drawers are ajar (`HiddenObjects`).
 
-        Args:
-            start: state before the prompt.
-            hidden: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
+        ``hidden``: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
         absent = tuple(self._hidden.describe(name, region) for name, region in hidden)

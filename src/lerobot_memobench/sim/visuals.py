@@ -41,10 +41,7 @@ PLACEHOLDER_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0,
 
 
 def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
-    """Return a model for poses and lights, and the draw list of the scene.
-
-    Args:
-        spec: scene with visual geoms; it is modified.
+    """Return a model for poses and lights, and the draw list of a scene with visual geoms; ``spec`` is modified.
 
     Raises:
         ValueError: MuJoCo cannot read a file.

@@ -180,10 +180,7 @@ class StartState:
     A tolerance of poses could store a count between events. Strict scenes have none: a detent at home restores the arm
     (`in_detent`) and, if the scene is nearly in its start state (`nearly_as_begun`), the whole scene.
 
-    Args:
-        model, data: model and data of the simulation; poses must match the present state.
-        objects: names of the objects.
-        joints: name in atoms -> articulation and address in qpos, of each door, drawer and knob.
+    The poses of ``data`` must match the present state. ``joints``: as of `World`.
     """
 
     def __init__(
@@ -218,8 +215,7 @@ class StartState:
     def mark_step(self, goes_on: bool = True) -> None:
         """Store the state at the beginning of a step: a hand that leaves home in the step still counts as home.
 
-        Args:
-            goes_on: whether the present state precedes the next one; False for a restore.
+        ``goes_on``: whether the present state precedes the next one; False for a restore.
         """
         self._previous = self._current_state() if goes_on else None
 

@@ -54,7 +54,7 @@ class Region:
     """A named place on ``target``.
 
     Attributes:
-        name: name inside the file; atoms use ``full_name``.
+        name: inside the file; atoms use ``full_name``.
         target: fixture (or object) that carries the region.
         ranges: rectangles (x1, y1, x2, y2) relative to the target's centre, m; empty for a site of the target.
         yaw: interval (low, high) of the initial yaw, rad.
@@ -261,7 +261,6 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
 
 
 def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
-    """Return the problem's name and its sections."""
     expected = "(define (problem NAME) ...)"
     head, rest = root.head(expected)
     if head != "define" or not rest:
