@@ -159,6 +159,7 @@ class Episode:
         rng = generator(self.published, self.seed, 5, self.settings.salt)
         drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)
         if self.published.prompt is None:
+            # By the law of the others a policy with a clock would count to one in 80 % (docs/benchmark/suites.md).
             drawn[0] = rng.uniform(0, LONGEST_HOLD)
         return iter(np.ceil(np.minimum(drawn, LONGEST_HOLD)).astype(int).tolist())
 

@@ -109,7 +109,7 @@ def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
         spec = scene_spec(task)
         model = spec.compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
-    if task.suite == STRICT:
+    if task.suite == STRICT:  # detents depend on the assets, whose sizes come from a compiled model
         add_detents(spec, assets)
         model = spec.compile()
     missing = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name, task.suite).stand_in]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
-STABILISATION_STEPS = 10
+STABILISATION_STEPS = 10  # objects start 1 to 8 cm above the table and fall in these steps
 SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
 """Largest horizontal shift of an object while a scene settles, m, and largest speed after it, m/s or rad/s."""
 MAX_SCENES = 200
@@ -230,6 +230,7 @@ class Simulation:
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
+        # Horizontal shifts only, because the objects fall.
         shifts = [self.data.body(name).xpos[:2] - position[:2] for name, position in drawn_positions.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED

@@ -37,6 +37,7 @@ _REQUIRED = (":language", ":fixtures", ":init", ":goal")
 _REGION = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
 _REGION_CLAUSES = (":target", ":ranges", ":yaw_rotation")
 _NOT_IN_INIT = {*LATCHES, *SINCE_START}
+#: Excludes words that `float` accepts: nan, inf, 1_000.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _THING = ("object", "fixture")

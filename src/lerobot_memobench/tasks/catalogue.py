@@ -285,7 +285,7 @@ def find_tasks(folder: str | Path) -> list[Path]:
         raise MemobenchError(f"found no {BDDL_FILE} in {root} or below it; expected a task in the published format")
     by_name: dict[str, Path] = {}
     for path in task_folders:
-        other = by_name.setdefault(path.resolve().name, path)
+        other = by_name.setdefault(path.resolve().name, path)  # "." has no name
         if other != path:
             raise MemobenchError(f"{other} and {path} hold tasks of one name; results are kept by name, so rename one")
     return task_folders
