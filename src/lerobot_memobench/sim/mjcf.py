@@ -116,8 +116,8 @@ def _user_class(path: Path) -> ClassFile:
             expect(element.tag in USER_TAGS, f"the element <{element.tag}>", f"only {', '.join(USER_TAGS)}")
             for name in element.attrib:
                 expect(name == "file" or not name.startswith("file"), f"the attribute {name!r}", "'file' only")
-        named = all(asset.get("name") for asset in root.iterfind("asset/*"))
-        expect(named, "an asset without a name", "a name for each")
+        have_names = all(asset.get("name") for asset in root.iterfind("asset/*"))
+        expect(have_names, "an asset without a name", "a name for each")
         geoms, bodies = root.findall("worldbody/body/body[@name='object']//geom"), root.findall("worldbody/body")
         whole = len(geoms) == len(list(root.iter("geom"))) and len(bodies) == 1
         expect(whole, "another structure", "one body in <worldbody>, and in it a body 'object' with all geoms")
