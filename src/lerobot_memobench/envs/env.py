@@ -164,7 +164,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         With ``prompt_in=reset`` the prompt plays here, and the first observation is the first execution frame.
         """
         super().reset(seed=seed)
-        named = seed is not None  # a drawn seed is not used again
+        repeatable = seed is not None  # a drawn seed is not used again
         self._seed = seed = int(self.np_random.integers(*UNSEEDED)) if seed is None else int(seed)
         self._started = time.monotonic()
         self._began, self._closed, self._over, self._not_run = True, False, False, None
@@ -176,7 +176,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._scene_seed in SPLITS[SEALED] and settings.salt is None:
             _warn_of_sealed_seeds()
         with self._ending_episode():
-            self.episode.reset(self._scene_seed, variant, keep_prompt=named)
+            self.episode.reset(self._scene_seed, variant, keep_prompt=repeatable)
             if settings.interference:
                 self._others = self._others or Interference(self._task, settings)
                 self._others.begin(self._scene_seed)
@@ -412,11 +412,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     """End logged episodes at their first step with the logged outcome, without simulation.
 
     Batch size and rows stay the same, so the policy acts in the other rows as in an uninterrupted evaluation.
-    Observations of a skipped episode are blank.
-
-    Args:
-        make: makes a `MemobenchEnv`.
-        log_dir: folder of the log, read once, at the first reset.
+    Observations of a skipped episode are blank. The log is read once, at the first reset.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
@@ -447,7 +443,6 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
     def _records(self) -> dict[int, dict[str, Any]]:
-        """Return episode -> log line, for this environment's task."""
         if self._logged is None:
             lines = read_lines(self._log_dir) if has_log(self._log_dir) else []
             name = self.get_wrapper_attr("task")

@@ -159,6 +159,7 @@ class Episode:
         rng = generator(self.published, self.seed, 5, self.settings.salt)
         drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)
         if self.published.prompt is None:
+            # By the law of the others a policy with a clock would count to one in 80 % (docs/benchmark/suites.md).
             drawn[0] = rng.uniform(0, LONGEST_HOLD)
         return iter(np.ceil(np.minimum(drawn, LONGEST_HOLD)).astype(int).tolist())
 
@@ -368,10 +369,8 @@ def referent_of(task: Task, seed: int, salt: str | None = None) -> Task:
     """Return the variant of a task that the seed draws.
 
     Draws are balanced: from the first seed of a split (`constants.SPLITS`), each block of as many seeds as variants
-    contains every variant once, in random order. All variants are equally frequent and independent of the layout.
-
-    Args:
-        salt: of a sealed evaluation (`EnvSettings.salt`): another order of each block.
+    contains every variant once, in random order; ``salt`` (`EnvSettings.salt`) changes the order. All variants are
+    equally frequent and independent of the layout.
     """
     if task.num_variants == 1:
         return task
@@ -404,9 +403,12 @@ def _wrong_atoms(task: Task) -> Iterator[Atom]:
         for other in task.objects
         if other not in atom.args and task.objects[other] == task.objects.get(name)
     ]
-    others = [
-        atom for k in range(task.num_variants) for each in task.variant(k).checkpoints for atom in atoms(each.goal)
+    variant_atoms = [
+        atom
+        for k in range(task.num_variants)
+        for checkpoint in task.variant(k).checkpoints
+        for atom in atoms(checkpoint.goal)
     ]
-    for atom in dict.fromkeys([*siblings, *others]):
+    for atom in dict.fromkeys([*siblings, *variant_atoms]):
         if atom.predicate in ("on", "in") and atom not in own:
             yield atom

@@ -131,12 +131,7 @@ class EpisodeRecord(TypedDict):
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
-    """Return the log line of an episode, an `EpisodeRecord`.
-
-    Args:
-        number: number of the episode in its evaluation, from 0.
-        wall_s: duration of the episode, s.
-    """
+    """Return the log line of an episode, an `EpisodeRecord`; ``number``: its field ``episode``."""
     progress, task, fault, choice = episode.progress, episode.task, episode.fault, episode.choice
     failure = classify_failure(
         *(task, progress.first_step, episode.success, episode.drifted),
@@ -297,13 +292,9 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
 
 
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file; see `joined`.
+    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file.
 
-    Args:
-        problems: see `read_lines`.
-
-    Raises:
-        MemobenchError: see `read_lines` and `joined`; or there is no evaluation's file.
+    Arguments and errors as of `read_lines` and `joined`; also raises without an evaluation's file.
     """
     lines = read_lines(directory, problems)
     return joined(Path(directory), read_evaluation(Path(directory)), lines)
@@ -345,11 +336,12 @@ def _contradictions(record: Mapping[str, Any], own_tasks: bool) -> Iterator[str]
         **dict.fromkeys(("lost", "held_steps"), record.get("suite") == STRICT),
         **{"paused_steps": pauses, "corrupted": record.get("corrupt", INTACT) != INTACT},
     }
-    extra = [name for name, given in of_settings.items() if name in record and not given]
+    extra = [name for name, allowed in of_settings.items() if name in record and not allowed]
     yield from (f"{name}: absent and {record[name]}" for name in extra)
     if "not_run" not in record:
         needed = {"choice": evidence, "paused_steps": pauses}
-        yield from (f"{name}: recorded and absent" for name, given in needed.items() if given and name not in record)
+        absent = [name for name, required in needed.items() if required and name not in record]
+        yield from (f"{name}: recorded and absent" for name in absent)
     if suite_of(record["task"]) is not None and not own_tasks:
         memory_type = group_of(record["task"])
         if memory_type != record["memory_type"]:
@@ -370,11 +362,11 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
     files = _log_files(directory)
     if not files:
         raise _without_log(directory)
-    found: list[str] = []
+    faults: list[str] = []
     newest: dict[Key, tuple[float, dict[str, Any]]] = {}
     outcomes: dict[Key, set[bool]] = {}
     for file in files:
-        for line in _read_file(file, found):
+        for line in _read_file(file, faults):
             written = float(line.pop(WRITTEN_AT, 0.0))
             key = key_of(line)
             if "not_run" not in line:
@@ -383,15 +375,15 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
                 newest[key] = (written, line)
     twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
     if twice:
-        found.append(
+        faults.append(
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
             f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
         )
     if problems is not None:
-        problems += found
+        problems += faults
     else:
-        for problem in found:
-            logger.warning("%s", problem)
+        for fault in faults:
+            logger.warning("%s", fault)
     return [newest[key][1] for key in sorted(newest)]
 
 
@@ -414,11 +406,11 @@ def _without_log(directory: Path) -> MemobenchError:
 
 def not_run(records: Iterable[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
     """Return task -> its episodes that could not be run."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    by_task: dict[str, list[Mapping[str, Any]]] = {}
     for record in records:
         if "not_run" in record:
-            found.setdefault(record["task"], []).append(record)
-    return found
+            by_task.setdefault(record["task"], []).append(record)
+    return by_task
 
 
 def notes_on_not_run(records: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -67,9 +67,9 @@ _CHECKED: dict[Any, Any] = {
 _HINTS = typing.get_type_hints(EnvSettings)
 _FIELDS: dict[str, Any] = {
     **{
-        each.name: _CHECKED[next(iter(typing.get_args(_HINTS[each.name])), _HINTS[each.name])]
-        for each in fields(EnvSettings)
-        if each.name not in NOT_COMPARED
+        setting.name: _CHECKED[next(iter(typing.get_args(_HINTS[setting.name])), _HINTS[setting.name])]
+        for setting in fields(EnvSettings)
+        if setting.name not in NOT_COMPARED
     },
     **{HOLD: Count, GOALS: Count, SCENE_HASHES: Count, INPUTS: Name},
 }
@@ -203,11 +203,9 @@ class Card(TypedDict):
 
 
 def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
-    """Return the content of an evaluation's file.
+    """Return the content of an evaluation's file; ``place``: its folder, or the file.
 
-    Args:
-        place: folder of the evaluation, or a file.
-        whole: require everything that resuming and repeating need.
+    With ``whole``, require everything that resuming and repeating need.
 
     Raises:
         MemobenchError: the file is missing, incomplete, malformed or of another format.
@@ -215,14 +213,14 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     file = place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
     advice = "expected an evaluation's file as `lerobot eval` writes it"
     try:
-        found: dict[str, Any] = read_json(file, Card, advice)
+        card: dict[str, Any] = read_json(file, Card, advice)
     except FileNotFoundError:
         raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
-    missing = [name for name in Card.__annotations__ if name not in found]
-    missing += [f"{name} in protocol" for name in EXTENT if name not in found["protocol"]]
+    missing = [name for name in Card.__annotations__ if name not in card]
+    missing += [f"{name} in protocol" for name in EXTENT if name not in card["protocol"]]
     if whole and missing:
         raise MemobenchError(f"{file}: found no {', '.join(missing)}; {advice}")
-    return found
+    return card
 
 
 def has_evaluation(folder: Path) -> bool:
@@ -244,10 +242,10 @@ def check_facts(folder: Path, facts: Mapping[str, Any]) -> None:
     """
     if not has_evaluation(folder):
         return
-    if found := differences_of_parts(read_evaluation(folder), facts):
-        what = "policy" if all(each.startswith(f"{POLICY}.") for each in found) else "protocol"
+    if differences := differences_of_parts(read_evaluation(folder), facts):
+        what = "policy" if all(difference.startswith(f"{POLICY}.") for difference in differences) else "protocol"
         raise MemobenchError(
-            f"{folder} holds episodes of another {what} ({'; '.join(found)}, the first value being that of the "
+            f"{folder} holds episodes of another {what} ({'; '.join(differences)}, the first value being that of the "
             "episodes there); evaluate into another folder"
         )
 
@@ -275,9 +273,7 @@ def differences(
 
     A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`).
 
-    Args:
-        extent: whether tasks and number of episodes are compared.
-        ignore: settings that may differ.
+    ``extent``: whether tasks and number of episodes are compared.
     """
     left_out = {*ignore, POLICY, SCENE_HASHES, *(() if extent else EXTENT)}
     return _differing({name: value for name, value in a.items() if name not in left_out}, b)
@@ -290,20 +286,20 @@ def differences_of_parts(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str
 
 
 def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
-    found = []
+    differences = []
     for key, value in a.items():
         if key not in b or b[key] == value:
             continue
         other = b[key]
         if isinstance(value, Mapping) and isinstance(other, Mapping):
-            found += _differing(value, other, f"{prefix}{key}.")
+            differences += _differing(value, other, f"{prefix}{key}.")
         else:
-            found.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
-    return found
+            differences.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
+    return differences
 
 
 def _text(value: Any) -> str:
     if not isinstance(value, list):
         return cut(str(value))
-    shown = ", ".join(cut(str(each)) for each in value[:3])
+    shown = ", ".join(cut(str(item)) for item in value[:3])
     return f"{shown}, … ({len(value)})" if len(value) > 3 else shown

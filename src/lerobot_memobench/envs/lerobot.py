@@ -78,7 +78,7 @@ _TYPES = typing.get_type_hints(EnvSettings)
 # LeRobot reads `--env.<name>` into fields of the configuration itself.
 _WithSettings: Any = make_dataclass(
     "_WithSettings",
-    [(each.name, _TYPES[each.name], field(default=each.default)) for each in fields(EnvSettings)],
+    [(setting.name, _TYPES[setting.name], field(default=setting.default)) for setting in fields(EnvSettings)],
     bases=(EnvConfig,),
 )
 
@@ -134,7 +134,7 @@ class MemobenchEnvConfig(_WithSettings):
     @property
     def settings(self) -> EnvSettings:
         """Settings of each environment."""
-        return EnvSettings(**{each.name: getattr(self, each.name) for each in fields(EnvSettings)})
+        return EnvSettings(**{setting.name: getattr(self, setting.name) for setting in fields(EnvSettings)})
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -171,13 +171,13 @@ class MemobenchEnvConfig(_WithSettings):
                 )
         if not self.evidence or self.suite == STRICT:  # its tasks with one variant run each scene once
             return tasks
-        found = [task for task in tasks if load_task(task[2]).num_variants > 1]
-        if not found:
+        with_variants = [task for task in tasks if load_task(task[2]).num_variants > 1]
+        if not with_variants:
             raise MemobenchError(
                 "env.evidence=true runs each scene with each variant, but no chosen task has variants; choose object "
                 "or procedural tasks, or suite=strict"
             )
-        return found
+        return with_variants
 
     @ending_lerobots_command()
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
@@ -191,9 +191,10 @@ class MemobenchEnvConfig(_WithSettings):
             folder = self.resolved_log_dir()
             for suite in self.task.split(","):
                 own = asdict(self.settings.changed(suite=suite))
-                one = replace(self, task=None, log_dir=str(folder / suite), **own)
-                envs |= one.create_envs(n_envs, use_async_envs)
-                self.features, self.features_map = one.features, one.features_map  # of the checkpoint's convention
+                config = replace(self, task=None, log_dir=str(folder / suite), **own)
+                envs |= config.create_envs(n_envs, use_async_envs)
+                # Features are of the checkpoint's convention.
+                self.features, self.features_map = config.features, config.features_map
             return envs
         self._number_as_lerobot()
         chosen = self.selected()  # raises before a folder is created
@@ -259,9 +260,7 @@ class MemobenchEnvConfig(_WithSettings):
     def opener(self, policy: Any, by: Acting, log_dir: Path) -> Opener:
         """Return a function that opens the vector environment of a task for a policy.
 
-        Args:
-            policy: configuration of the policy; None if unknown.
-            by: description of the policy for the log.
+        ``policy``: its configuration, None if unknown. ``by``: its description for the log.
 
         Raises:
             MemobenchError: ``log_dir`` contains a log of another protocol.
@@ -292,7 +291,7 @@ class MemobenchEnvConfig(_WithSettings):
         folder = Path(self.log_dir)
         if self.resume or not has_log(folder):
             return folder
-        return next(place for k in count(2) if not (place := folder / f"evaluation-{k}").exists())
+        return next(candidate for k in count(2) if not (candidate := folder / f"evaluation-{k}").exists())
 
 
 def executed_actions(policy: Any) -> int:
@@ -329,7 +328,7 @@ def _vector(
         return _LazyAsyncVectorEnv(make, space, action_space(), METADATA)
     # LeRobot freezes finished rows of async environments only; a sync row would start another episode.
     return gym.vector.SyncVectorEnv(
-        [freeze_after_episode_end(one) for one in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
+        [freeze_after_episode_end(make_env) for make_env in make], autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP
     )
 
 

@@ -82,13 +82,13 @@ def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
     needed = obs_type_of(policy)
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
-        named = "" if needed == PIXELS else f" ({PRIVILEGED})"
+        extra = "" if needed == PIXELS else f" ({PRIVILEGED})"
         if suite in LIBERO_SUITES:
             raise MemobenchError(
-                f"{policy.type} reads more than pictures{named}, and suite={suite} has pictures alone; evaluate it in "
+                f"{policy.type} reads more than pictures{extra}, and suite={suite} has pictures alone; evaluate it in "
                 "memory tasks, or name a policy that reads pictures"
             )
-        raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{named}; set it to {wanted}")
+        raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{extra}; set it to {wanted}")
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
@@ -97,15 +97,15 @@ def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> st
     ``policy`` is a configuration or its class. A declared attribute ``inputs`` is returned. With ``oracle_memory`` the
     instruction ends with the completed checkpoints.
     """
-    found = getattr(policy, "inputs", None)
-    if not isinstance(found, tuple):
+    inputs = getattr(policy, "inputs", None)
+    if not isinstance(inputs, tuple):
         features = getattr(policy, "input_features", None) or {}
         types = {getattr(feature.type, "value", feature.type) for feature in features.values()}
         everything = not types & {"VISUAL", "ENV"}
         pixels = obs_type != OBJECTS and (everything or "VISUAL" in types)
         objects = obs_type != PIXELS and not _ignores_objects(policy) and (everything or "ENV" in types)
-        found = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
-    return ", ".join(found + (MEMORY_TEXT,) * oracle_memory) or NO_INPUT
+        inputs = (PIXEL_INPUT,) * pixels + (PRIVILEGED,) * objects
+    return ", ".join(inputs + (MEMORY_TEXT,) * oracle_memory) or NO_INPUT
 
 
 def chooses_inputs(policy: object) -> bool:
@@ -235,12 +235,12 @@ class Observer:
 
     def observation(self) -> dict[str, Any]:
         """Return the pictures and objects of the observation, see `observation_space`."""
-        found: dict[str, Any] = {}
+        observation: dict[str, Any] = {}
         if self._has_pictures:
-            found["pixels"] = in_convention(self._images, self._convention, self._mapping)
+            observation["pixels"] = in_convention(self._images, self._convention, self._mapping)
         if self._has_objects:
-            found["environment_state"] = self._objects.copy()  # may be returned again
-        return found
+            observation["environment_state"] = self._objects.copy()  # may be returned again
+        return observation
 
     def frame(self, episode: Episode) -> NDArray[np.uint8]:
         """Return both annotated cameras: last rendered, or rendered now if observations contain no pictures."""

@@ -38,14 +38,11 @@ SOURCES = ("tasks", "sim", "experts", "envs")
 class PromptPlayer:
     """Simulate a prompt step by step.
 
-    Args:
-        sim: running scene in the episode's initial state.
-        longest: maximum number of control steps.
-        file: cache file of the finished prompt; None for no file.
+    The scene of ``sim`` is in the episode's initial state. ``longest``: maximum number of control steps. ``file``:
+    cache file of the finished prompt, or None.
 
     Attributes:
-        over: whether the prompt has ended.
-        succeeded: whether the prompt succeeded, once it has ended.
+        over, succeeded: whether the prompt has ended, and then whether it succeeded.
         observed: whether frames before the end are read; if not, a restored prompt skips them.
     """
 
@@ -114,8 +111,8 @@ def _row(action: NDArray[np.float32], sim: Simulation) -> NDArray[np.float64]:
 
 def prompt_player(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> PromptPlayer:
     """Return a prompt that is restored if ``file`` contains it, else simulated. Arguments: see `PromptPlayer`."""
-    kept = None if file is None else _read(file, sum(_PARTS) + sim.physics_dim)
-    return PromptPlayer(demonstrator, sim, longest, file) if kept is None else RestoredPrompt(sim, *kept)
+    stored = None if file is None else _read(file, sum(_PARTS) + sim.physics_dim)
+    return PromptPlayer(demonstrator, sim, longest, file) if stored is None else RestoredPrompt(sim, *stored)
 
 
 def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
@@ -166,12 +163,12 @@ def _write(file: Path, rows: NDArray[np.float64], succeeded: bool) -> None:
 
 
 def _make_room(folder: Path) -> None:
-    found = []
+    entries = []
     for file in folder.glob("*.npz"):  # includes drafts of killed processes
         with contextlib.suppress(FileNotFoundError):  # removed by another process
-            found.append((file.stat().st_mtime_ns, file.stat().st_size, file))
-    excess = sum(size for _, size, _ in found) - LARGEST
-    for _, size, file in sorted(found):
+            entries.append((file.stat().st_mtime_ns, file.stat().st_size, file))
+    excess = sum(size for _, size, _ in entries) - LARGEST
+    for _, size, file in sorted(entries):
         if excess <= 0:
             return
         file.unlink(missing_ok=True)

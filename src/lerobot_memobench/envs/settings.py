@@ -64,7 +64,6 @@ EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}
 PICTURE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
-"""Form of a ``salt``."""
 INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
@@ -212,8 +211,8 @@ class EnvSettings:
 
     def __post_init__(self) -> None:
         self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})
-        for each in fields(self):
-            self._check(each.name, str(each.type), each.metadata)
+        for setting in fields(self):
+            self._check(setting.name, str(setting.type), setting.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
             check_choice("referent", self.referent, REFERENTS)
         if not 1 / SLOWEST <= self.speed <= 1 or abs(steps_per_action(self.speed) * self.speed - 1) > 0.02:
@@ -254,9 +253,9 @@ class EnvSettings:
                 f"observation_height and observation_width are {height} and {width}; expected even numbers up to "
                 f"{LARGEST}"
             )
-        for name, value in PICTURES.items():
-            if self.obs_type == OBJECTS and (given := getattr(self, name)) != value:
-                raise MemobenchError(f"{name}={given} is of pictures, and obs_type={OBJECTS} has none; leave it out")
+        for name, default in PICTURES.items():
+            if self.obs_type == OBJECTS and (value := getattr(self, name)) != default:
+                raise MemobenchError(f"{name}={value} is of pictures, and obs_type={OBJECTS} has none; leave it out")
         if (mapping := self.camera_name_mapping) is None:
             return
         if self.convention != MIRRORED:
@@ -315,7 +314,7 @@ class EnvSettings:
 
     def _require(self, names: Sequence[str], reason: str) -> None:
         """Raise unless settings have their default."""
-        defaults = {each.name: each.default for each in fields(self)}
+        defaults = {setting.name: setting.default for setting in fields(self)}
         for name in names:
             if (value := getattr(self, name)) != defaults[name]:
                 default = str(defaults[name]).lower()
@@ -331,10 +330,10 @@ class EnvSettings:
     def usual(self) -> dict[str, Any]:
         """Defaults that follow from other settings."""
         limits = {str(suite): steps for suite, steps in STEP_LIMITS.items()}
-        named = self.suite in limits or self.camera_name_mapping is not None
+        mirrored = self.suite in limits or self.camera_name_mapping is not None
         return {
             "horizon": limits.get(self.suite, horizon_of(self.difficulty)),
-            "convention": MIRRORED if named else UPRIGHT,  # as in LeRobot's environment `libero`
+            "convention": MIRRORED if mirrored else UPRIGHT,  # as in LeRobot's environment `libero`
         }
 
     @property
@@ -348,7 +347,7 @@ class EnvSettings:
         Raises:
             MemobenchError: a setting is unknown, or a value is not accepted.
         """
-        known = [each.name for each in fields(self)]
+        known = [setting.name for setting in fields(self)]
         for name in changes:
             if name not in known:
                 raise MemobenchError(f"unknown environment setting {name!r}; {nearest(name, known)}")
@@ -365,7 +364,7 @@ class EnvSettings:
 
 NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
 """Settings without effect on rollouts."""
-SETTINGS = tuple(each.name for each in fields(EnvSettings) if each.name not in NOT_COMPARED)
+SETTINGS = tuple(setting.name for setting in fields(EnvSettings) if setting.name not in NOT_COMPARED)
 """Settings with an effect on rollouts."""
 
 

@@ -22,14 +22,10 @@ if TYPE_CHECKING:
 
     from lerobot_memobench.envs.episode import Episode
 
-BAND = 64
-"""Height of the text above the pictures, pixels."""
-CLOCK = 96
-"""Width reserved for the clock, pixels."""
-CLOCK_BOTTOM = 24
-"""Lower edge of the clock, pixels from the top."""
-MARGIN = 8
-"""Left and right margin, pixels."""
+BAND, MARGIN = 64, 8
+"""Height of the text above the pictures, and margin at its sides, pixels."""
+CLOCK, CLOCK_BOTTOM = 96, 24
+"""Width reserved for the clock, and its lower edge from the top, pixels."""
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
 OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
 """Storage, Update, Compression in Okabe and Ito's palette, which colour-blind readers can distinguish."""

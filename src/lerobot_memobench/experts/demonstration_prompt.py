@@ -90,14 +90,14 @@ class PromptDemonstrator:
             yield from put_at(hand, held, position, rotation)
 
     def _point(self, hand: Hand) -> Steps:
-        place, _ = self._sim.asset_pose(self._referent)
-        above = place + (self._sim.assets[self._referent].top + 0.03) * UP
+        position, _ = self._sim.asset_pose(self._referent)
+        above = position + (self._sim.assets[self._referent].top + 0.03) * UP
         rotation = pointing(hand, above)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.015)
         for height in (0.0, 0.05, 0.0):
             yield from hand.move(above + height * UP, rotation, CLOSED, tolerance=0.008, speed=0.6, timeout=60)
         yield from hand.wait(PAUSE_STEPS, CLOSED)
-        self.succeeded = bool(np.linalg.norm((hand.position - place)[:2]) < 0.03)
+        self.succeeded = bool(np.linalg.norm((hand.position - position)[:2]) < 0.03)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
 
     def _highlight(self, hand: Hand) -> Steps:
@@ -119,6 +119,6 @@ def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, .
 
 def highlight_of(sim: Simulation, name: str) -> Highlight:
     """Return a highlight below an object."""
-    asset, (place, _) = sim.assets[name], sim.asset_pose(name)
-    spot = (float(place[0]), float(place[1]), float(place[2] + asset.bottom + 0.002))
+    asset, (position, _) = sim.assets[name], sim.asset_pose(name)
+    spot = (float(position[0]), float(position[1]), float(position[2] + asset.bottom + 0.002))
     return Highlight(spot, asset.radius + 0.035)

@@ -281,12 +281,8 @@ def blind_routine(task: Task, sim: Simulation, rng: np.random.Generator) -> Step
     """Reach a published task's goal, return home and repeat, forever: a baseline without memory.
 
     No state is kept between rounds, so the routine cannot count. It ignores prompt and instruction, and so hidden and
-    indicated objects.
-
-    Args:
-        task: published task; for a strict task the one it is derived from.
-        sim: running simulation; the hand's pose at the first action is home.
-        rng: random source of small variations.
+    indicated objects. ``task``: for a strict task the one it is derived from. The hand's pose at the first action is
+    home.
     """
     home = sim.eef_pose()
     while True:

@@ -443,10 +443,10 @@ def sweep_door_shut(hand: Hand, name: str) -> Steps:
             return
 
 
-def _sweep_rotation(hand: Hand, door: Door, place: Array, flip: float) -> Array:
+def _sweep_rotation(hand: Hand, door: Door, position: Array, flip: float) -> Array:
     """Return the rotation (3, 3) of a hand that closes along the door, leaned to reach a position (3,)."""
     closing = flip * door.along
-    lean = reach_lean(hand, place)
+    lean = reach_lean(hand, position)
     return leaned_rotation(closing, lean - (lean @ closing) * closing)
 
 
@@ -480,8 +480,8 @@ def _sweep_shut(hand: Hand, name: str) -> Steps:
 
     def pose(gap: float, height: float = 0.0, ahead: float = 0.0) -> tuple[Array, Array]:
         door = door_geometry(hand, name, ahead)
-        place = door.edge - PANEL_PUSH_INSET * door.along + gap * door.outward + (height - PANEL_PUSH_DEPTH) * UP
-        return place, _sweep_rotation(hand, door, place, flip)
+        position = door.edge - PANEL_PUSH_INSET * door.along + gap * door.outward + (height - PANEL_PUSH_DEPTH) * UP
+        return position, _sweep_rotation(hand, door, position, flip)
 
     yield from rise(hand, CLOSED, 0.26)
     for height, tolerance in ((0.12, 0.03), (0.0, 0.02)):

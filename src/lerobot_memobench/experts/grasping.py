@@ -318,14 +318,11 @@ def pick(
 ) -> Generator[NDArray[np.float32], None, Held | None]:
     """Grasp an object from above and lift it; retry failed grasps with other candidates.
 
+    Return the object with its pose in the hand, None if all attempts failed.
+
     Args:
-        hand: controlled arm.
-        name: object.
         avoid: horizontal direction (3,) along which the fingers should not close, because of the destination.
         place: destination of the object's origin (3,), m; distant destinations need other grasps.
-
-    Returns:
-        The grasped object and its pose in the hand, or None if all attempts failed.
     """
     failed = 0
     for attempt in range(MAX_ATTEMPTS):
@@ -382,13 +379,10 @@ def carry(
     """Move the held object's origin above a destination (3,) and lower it; stop early if it is dropped.
 
     Args:
-        hand: controlled arm.
-        held: carried object.
         destination: returns the present target of the object's origin (3,), m.
         turn: rotation (3, 3) of the hand on arrival.
-        clearance: height of the approach above the destination, m.
-        tolerance: position tolerance of the origin, m.
-        support: name of the support, ignored as an obstacle.
+        clearance, tolerance: height of the approach above the destination, and tolerance of the origin, m.
+        support: ignored as an obstacle.
     """
 
     def at(height: float) -> Target:

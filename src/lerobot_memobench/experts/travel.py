@@ -174,11 +174,8 @@ def finger_obstruction_cost(hand: Hand, name: str, target: Array, turn: Array) -
 def clear_height(hand: Hand, start: Array, end: Array, *, lowest: float, wide: float, but: Iterable[str]) -> float:
     """Return the height of the hand for a collision-free horizontal path, m; 0 without obstacles.
 
-    Args:
-        hand: controlled arm.
-        start, end: end points of the path, (3,).
-        lowest, wide: extent of hand and load below the grip site, and lateral extent, m.
-        but: names to ignore: the carried or grasped object and its support.
+    ``lowest``, ``wide``: extent of hand and load below the grip site and to its sides, m. ``but``: the carried or
+    grasped object and its support.
     """
     way = start + np.linspace(0.0, 1.0, 16)[:, None] * (end - start)
     height = 0.0

@@ -25,8 +25,8 @@ LIBERO_CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand
 
 def picture_names(convention: str, mapping: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return camera -> name of its picture, by a convention and LeRobot's ``camera_name_mapping``."""
-    given = mapping or {}
-    return {camera: given.get(LIBERO_CAMERAS[camera], name) for camera, name in CONVENTIONS[convention].items()}
+    mapping = mapping or {}
+    return {camera: mapping.get(LIBERO_CAMERAS[camera], name) for camera, name in CONVENTIONS[convention].items()}
 
 
 def in_convention(
@@ -39,8 +39,8 @@ def in_convention(
 
 def convention_of(features: Mapping[str, Any]) -> str | None:
     """Return the convention of a dataset's pictures by the description of its columns; None if it is unknown."""
-    pictures = {name: one for name, one in features.items() if one.get("dtype") in ("video", "image")}
-    stated = {one.get("convention") for one in pictures.values()}
+    pictures = {name: feature for name, feature in features.items() if feature.get("dtype") in ("video", "image")}
+    stated = {feature.get("convention") for feature in pictures.values()}
     if "observation.images.image2" in pictures or MIRRORED in stated:
         return MIRRORED
     ours = pictures and "checkpoint.index" in features  # a column of this package

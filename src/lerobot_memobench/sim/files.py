@@ -104,7 +104,7 @@ def usable(found: Sequence[AssetsFolder]) -> AssetsFolder | None:
 
 def unused(found: Iterable[AssetsFolder]) -> str:
     """Return the part of a message that names places with a fault."""
-    return "".join(f"; not used: {place.source}, {place.fault}" for place in found if place.fault)
+    return "".join(f"; not used: {folder.source}, {folder.fault}" for folder in found if folder.fault)
 
 
 def asset(name: str) -> Path:
@@ -114,8 +114,8 @@ def asset(name: str) -> Path:
 
 def _candidates() -> Iterator[tuple[str, Path]]:
     """Yield source and folder of each place to examine. Only the user's folder may not exist."""
-    if named := os.environ.get(ASSETS_VARIABLE):
-        folder = Path(os.path.expanduser(named)).absolute()
+    if setting := os.environ.get(ASSETS_VARIABLE):
+        folder = Path(os.path.expanduser(setting)).absolute()
         checkout = folder / "libero/libero/assets"
         yield ASSETS_VARIABLE, checkout if checkout.is_dir() else folder
     config = Path(os.path.expanduser(os.environ.get("LIBERO_CONFIG_PATH") or "~/.libero"), "config.yaml")
@@ -128,8 +128,8 @@ def _candidates() -> Iterator[tuple[str, Path]]:
     snapshots = Path(constants.HF_HUB_CACHE, f"datasets--{REPOSITORY.replace('/', '--')}", "snapshots")
     yield from ((HUB_CACHE, folder) for folder in sorted(snapshots.glob("*/")))
     installed = importlib.util.find_spec(PACKAGE)
-    for place in (installed.submodule_search_locations or ()) if installed else ():
-        yield f"the packages {DISTRIBUTIONS}", Path(place, "assets")
+    for location in (installed.submodule_search_locations or ()) if installed else ():
+        yield f"the packages {DISTRIBUTIONS}", Path(location, "assets")
 
 
 @cache
@@ -227,9 +227,9 @@ def obtain() -> AssetsFolder:
     from huggingface_hub import snapshot_download
 
     folders = places()
-    if (place := usable(folders)) is not None:
-        return place
-    wanted, damaged = [*known_hashes()], any(place.source == HUB_CACHE for place in folders)
+    if (folder := usable(folders)) is not None:
+        return folder
+    wanted, damaged = [*known_hashes()], any(folder.source == HUB_CACHE for folder in folders)
     try:
         snapshot_download(REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
     except (OSError, httpx.TransportError) as error:

@@ -73,18 +73,18 @@ def class_file(class_name: str, suite: str) -> ClassFile:
         MemobenchError: the class is unknown, or its files are missing or have unexpected content.
     """
     own = own_objects()
-    given = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
+    user_classes = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
     if class_name in ALL_CLASSES:
         known = ALL_CLASSES[class_name]
         mjcf = known.mjcf(class_name)
         return _object_class(files.asset(mjcf), known.turns, posixpath.dirname(mjcf))
-    if file_name(class_name, "the class of an object") in given:
-        return _user_class(given[class_name])
+    if file_name(class_name, "the class of an object") in user_classes:
+        return _user_class(user_classes[class_name])
     scan = files.scan(class_name) if suite != STRICT else None
     if scan is not None:
         return _scanned_class(scan)
     if class_name not in own:
-        near = nearest(class_name, {*ALL_CLASSES, *own, *given})
+        near = nearest(class_name, {*ALL_CLASSES, *own, *user_classes})
         add = f"set {files.OBJECTS_VARIABLE} to a folder with {class_name}/{class_name}.xml, see {GUIDE}"
         raise MemobenchError(f"there is no class {class_name!r} ({near}); to add it, {add}")
     return replace(_object_class(own[class_name], SCAN_TURNS), stand_in=suite != STRICT)
@@ -116,11 +116,12 @@ def _user_class(path: Path) -> ClassFile:
             expect(element.tag in USER_TAGS, f"the element <{element.tag}>", f"only {', '.join(USER_TAGS)}")
             for name in element.attrib:
                 expect(name == "file" or not name.startswith("file"), f"the attribute {name!r}", "'file' only")
-        expect(all(one.get("name") for one in root.iterfind("asset/*")), "an asset without a name", "a name for each")
-        found = root.findall("worldbody/body/body[@name='object']//geom"), root.findall("worldbody/body")
-        whole = len(found[0]) == len(list(root.iter("geom"))) and len(found[1]) == 1
+        have_names = all(asset.get("name") for asset in root.iterfind("asset/*"))
+        expect(have_names, "an asset without a name", "a name for each")
+        geoms, bodies = root.findall("worldbody/body/body[@name='object']//geom"), root.findall("worldbody/body")
+        whole = len(geoms) == len(list(root.iter("geom"))) and len(bodies) == 1
         expect(whole, "another structure", "one body in <worldbody>, and in it a body 'object' with all geoms")
-        missing = {*SIZE_SITES} - {one.get("name", "") for one in root.iterfind("worldbody/body/site[@pos]")}
+        missing = {*SIZE_SITES} - {site.get("name", "") for site in root.iterfind("worldbody/body/site[@pos]")}
         expect(
             not missing, f"no pos of {', '.join(sorted(missing))}", f"sites {', '.join(SIZE_SITES)} in the outer body"
         )

@@ -168,8 +168,8 @@ class ObjectSlots:
                 *_NORMALS_ARGUMENT, count, mujoco.mjMAXVAL,
             )  # fmt: skip
             owners = self.owners(np.where(geoms >= 0, model.geom_bodyid[geoms], -1))
-            mine = tried[inside] // POINTS_PER_THING
-            hits += np.bincount(mine[owners == mine], minlength=len(hits))
+            aimed_at = tried[inside] // POINTS_PER_THING
+            hits += np.bincount(aimed_at[owners == aimed_at], minlength=len(hits))
         return hits >= MIN_VISIBLE_POINTS
 
     def _row(self, thing: Thing) -> Array:

@@ -66,9 +66,7 @@ class Placer:
     def place(self, seed: int, draw: int = 0) -> None:
         """Sample a placement of a seed and write it into model (fixtures) and data (objects, joints).
 
-        Args:
-            seed: seed of the scene.
-            draw: number of the scene; only 0 is LIBERO's.
+        Of the scenes of a seed, only ``draw`` 0 is LIBERO's.
 
         Raises:
             MemobenchError: a region has no free space for its object.
@@ -147,12 +145,12 @@ class Placer:
         name, where = atom.args
         rectangles, base = self._room(atom, poses)
         alone = self._assets[name].kind == "fixture" or where in self._assets
-        others = {} if alone else poses
+        obstacles = {} if alone else poses
         known, z = self._files[name], base[2] - self._files[name].bottom
         for _ in range(MAX_DRAWS):
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             position = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
-            if all(_is_clear_of(known, position, self._files[other], others[other]) for other in others):
+            if all(_is_clear_of(known, position, self._files[obstacle], obstacles[obstacle]) for obstacle in obstacles):
                 return np.array([*position, *self._turn(name, where, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "

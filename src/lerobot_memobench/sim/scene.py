@@ -109,7 +109,7 @@ def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
         spec = scene_spec(task)
         model = spec.compile()
     assets = {name: _asset(model, task, name, class_name) for name, class_name in instances(task)}
-    if task.suite == STRICT:
+    if task.suite == STRICT:  # detents depend on the assets, whose sizes come from a compiled model
         add_detents(spec, assets)
         model = spec.compile()
     missing = [class_name for _, class_name in instances(task) if mjcf.class_file(class_name, task.suite).stand_in]
@@ -167,8 +167,8 @@ def scene_xml(task: Task, visuals: bool) -> str:
     arena = arena_of(task)
     _place_arm(world, arena)
     room = mjcf.arena(arena.file)
-    for place, element in enumerate(_room(room, arena, task)):
-        world.insert(place, element)
+    for index, element in enumerate(_room(room, arena, task)):
+        world.insert(index, element)
     classes: dict[str, mjcf.ClassFile] = {}
     for name, class_name in instances(task):
         classes[class_name] = known = mjcf.class_file(class_name, task.suite)
@@ -221,7 +221,6 @@ def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
 
 
 def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> None:
-    """Set sizes and positions of the table's board and legs."""
     x, y, half = (side / 2 for side in TABLE_SIZE)
     table.set("pos", mjcf.format_numbers((0, 0, TABLE_TOP - half)))
     leg = (TABLE_TOP - half) / 2
@@ -273,13 +272,13 @@ def _add_handles(body: ET.Element, name: str, class_name: str) -> None:
 
 def _strip(world: ET.Element, assets: ET.Element) -> None:
     """Remove visual geoms, materials, lights and colours; MuJoCo's rays pass through transparent geoms."""
-    _remove(world, lambda one: one.tag == "light")
+    _remove(world, lambda element: element.tag == "light")
     _remove(world, mjcf.is_visual)
     for geom in world.iter("geom"):
         for name in ("material", "rgba"):
             geom.attrib.pop(name, None)
     used = {geom.get("mesh") for geom in world.iter("geom")}
-    _remove(assets, lambda one: one.tag != "mesh" or one.get("name") not in used)
+    _remove(assets, lambda element: element.tag != "mesh" or element.get("name") not in used)
 
 
 def _remove(root: ET.Element, unwanted: Callable[[ET.Element], bool]) -> None:
@@ -397,14 +396,14 @@ def _add_spring(
     lever = 1.0 if articulation.kind == "drawer" else DETENT_LEVER
     reach = travel * lever
     dead_centre = articulation.closed_q + np.sign(articulation.open_q - articulation.closed_q) * travel
-    point, place = _moving_point(joint, lever, dead_centre)
+    point, position = _moving_point(joint, lever, dead_centre)
     turn = Rotation.from_quat(joint.parent.quat, scalar_first=True)  # LIBERO's knob is turned by 90°
-    fixed = joint.parent.pos + turn.apply(place) + DETENT_OFFSET * reach * np.array([0.0, 0.0, 1.0])
+    fixed = joint.parent.pos + turn.apply(position) + DETENT_OFFSET * reach * np.array([0.0, 0.0, 1.0])
     ends = {"fixed": (fixture, fixed), "moving": (joint.parent, point)}
     tendon = spec.add_tendon(name=f"{joint.name}_detent", group=SITE_GROUP)
-    for end, (body, position) in ends.items():
+    for end, (body, offset) in ends.items():
         name = f"{joint.name}_detent_{end}"
-        body.add_site(name=name, pos=position.tolist(), size=[0.001] * 3, group=SITE_GROUP)
+        body.add_site(name=name, pos=offset.tolist(), size=[0.001] * 3, group=SITE_GROUP)
         tendon.wrap_site(name)
     closed = float(np.hypot(1.0, DETENT_OFFSET))
     pushes = (DETENT_SLACK - closed) / closed * reach * lever

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
-STABILISATION_STEPS = 10
+STABILISATION_STEPS = 10  # objects start 1 to 8 cm above the table and fall in these steps
 SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
 """Largest horizontal shift of an object while a scene settles, m, and largest speed after it, m/s or rad/s."""
 MAX_SCENES = 200
@@ -182,7 +182,6 @@ class Simulation:
         again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
 
         Args:
-            seed: seed of the scene.
             settling: called with `holds` after each stabilisation step.
             state: initial state (state_dim,) of arm, objects and joints, as of `tasks.libero_suites`. The seed then
                 draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
@@ -231,6 +230,7 @@ class Simulation:
                 self._check_physics(self.data.time)
             if settling is not None:
                 settling(self.holds)
+        # Horizontal shifts only, because the objects fall.
         shifts = [self.data.body(name).xpos[:2] - position[:2] for name, position in drawn_positions.items()]
         moved = max((float(np.linalg.norm(shift)) for shift in shifts), default=0.0)
         return moved <= SETTLED_SHIFT and float(np.abs(self.data.qvel[robot.OTHERS]).max(initial=0.0)) <= SETTLED_SPEED
@@ -294,8 +294,8 @@ class Simulation:
         self.restore(start)
         if arm_only:
             self._hidden.absent = absent
-            others = robot.OTHERS
-            self.data.qpos[others], self.data.qvel[others] = qpos[others], qvel[others]
+            rest = robot.OTHERS
+            self.data.qpos[rest], self.data.qvel[rest] = qpos[rest], qvel[rest]
             mujoco.mj_step1(self.model, self.data)
         else:
             self._start.mark_objects(self.absent)
@@ -320,11 +320,7 @@ class Simulation:
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
         """Set a recorded state for queries and rendering.
 
-        The previously set state counts as its predecessor (`StartState.mark_step`).
-
-        Args:
-            state: (state_dim,) as returned by `state()`.
-            fixture_poses: as returned by `fixture_poses()`; unchanged by default.
+        The previously set state counts as its predecessor (`StartState.mark_step`). Fixtures stay by default.
 
         Raises:
             MemobenchError: the state has another shape.
@@ -364,9 +360,7 @@ class Simulation:
     def restore(self, snapshot: Snapshot, *, replayed: bool = False) -> None:
         """Restore a snapshot of this simulation, bit for bit.
 
-        Args:
-            snapshot: state returned by `snapshot`.
-            replayed: whether the present state precedes the snapshot, as in the original episode.
+        ``replayed``: whether the present state precedes the snapshot, as in the original episode.
         """
         self._start.mark_step(goes_on=replayed and snapshot.goes_on)
         mujoco.mj_setState(self.model, self.data, snapshot.physics, self._full)
@@ -382,9 +376,7 @@ class Simulation:
         Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
         objects are absent until their drawers are ajar (`HiddenObjects`).
 
-        Args:
-            start: state before the prompt.
-            hidden: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
+        ``hidden``: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
         absent = tuple(self._hidden.describe(name, region) for name, region in hidden)
@@ -483,8 +475,8 @@ class Simulation:
 
     def gripper_opening(self) -> float:
         """Return the distance between the fingers, m."""
-        one, other = self.data.qpos[robot.FINGERS]
-        return float(one - other)
+        first, second = self.data.qpos[robot.FINGERS]
+        return float(first - second)
 
     def gripper_command(self) -> float:
         """Return the gripper command, from −1 (open) to 1 (closed); a control step changes it by a quarter."""

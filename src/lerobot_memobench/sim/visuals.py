@@ -41,10 +41,7 @@ PLACEHOLDER_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0,
 
 
 def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
-    """Return a model for poses and lights, and the draw list of the scene.
-
-    Args:
-        spec: scene with visual geoms; it is modified.
+    """Return a model for poses and lights, and the draw list of a scene with visual geoms; ``spec`` is modified.
 
     Raises:
         ValueError: MuJoCo cannot read a file.
@@ -89,8 +86,8 @@ def _path(key: str) -> Path:
 
 def _read_cache(key: str) -> Arrays | None:
     with contextlib.suppress(OSError, ValueError, EOFError):  # missing or damaged
-        kept: Arrays = np.load(_path(key), allow_pickle=False)[0]
-        return kept
+        arrays: Arrays = np.load(_path(key), allow_pickle=False)[0]
+        return arrays
     return None
 
 
@@ -175,10 +172,10 @@ def _set_frames(model: mujoco.MjModel, meshes: Mapping[str, Arrays]) -> None:
     """Give geoms of placeholders the frames and sizes of the cached meshes, which define texture coordinates."""
     for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value):
         mesh = int(model.geom_dataid[geom])
-        kept = meshes.get(model.mesh(mesh).name)
-        if kept is None:
+        cached = meshes.get(model.mesh(mesh).name)
+        if cached is None:
             continue
-        position, quaternion, size = np.split(kept["frame"], (3, 7))
+        position, quaternion, size = np.split(cached["frame"], (3, 7))
         model.mesh_pos[mesh], model.mesh_quat[mesh] = 0, (1, 0, 0, 0)  # a cached mesh is in its geom's frame
         offset, turn = np.empty(3), np.empty(4)
         mujoco.mju_rotVecQuat(offset, position, model.geom_quat[geom])

@@ -136,11 +136,11 @@ class World:
     def _in(self, a: str, region: str) -> bool:
         """LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`."""
         self._index(a)
-        place, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
+        point, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
         half = np.abs(rotation @ size)
         low, high = position - half, position + half
         low[2] -= IN_SLACK
-        return bool(np.all(place > low) and np.all(place < high))
+        return bool(np.all(point > low) and np.all(point < high))
 
     def _on_object(self, a: str, b: str) -> bool:
         self._index(a)
@@ -180,10 +180,7 @@ class StartState:
     A tolerance of poses could store a count between events. Strict scenes have none: a detent at home restores the arm
     (`in_detent`) and, if the scene is nearly in its start state (`nearly_as_begun`), the whole scene.
 
-    Args:
-        model, data: model and data of the simulation; poses must match the present state.
-        objects: names of the objects.
-        joints: name in atoms -> articulation and address in qpos, of each door, drawer and knob.
+    The poses of ``data`` must match the present state. ``joints``: as of `World`.
     """
 
     def __init__(
@@ -218,8 +215,7 @@ class StartState:
     def mark_step(self, goes_on: bool = True) -> None:
         """Store the state at the beginning of a step: a hand that leaves home in the step still counts as home.
 
-        Args:
-            goes_on: whether the present state precedes the next one; False for a restore.
+        ``goes_on``: whether the present state precedes the next one; False for a restore.
         """
         self._previous = self._current_state() if goes_on else None
 

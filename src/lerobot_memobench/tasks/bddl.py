@@ -37,6 +37,7 @@ _REQUIRED = (":language", ":fixtures", ":init", ":goal")
 _REGION = "a region such as (NAME (:target FIXTURE) (:ranges ((x1 y1 x2 y2))) (:yaw_rotation ((low high))))"
 _REGION_CLAUSES = (":target", ":ranges", ":yaw_rotation")
 _NOT_IN_INIT = {*LATCHES, *SINCE_START}
+#: Excludes words that `float` accepts: nan, inf, 1_000.
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 _THING = ("object", "fixture")
@@ -54,7 +55,7 @@ class Region:
     """A named place on ``target``.
 
     Attributes:
-        name: name inside the file; atoms use ``full_name``.
+        name: inside the file; atoms use ``full_name``.
         target: fixture (or object) that carries the region.
         ranges: rectangles (x1, y1, x2, y2) relative to the target's centre, m; empty for a site of the target.
         yaw: interval (low, high) of the initial yaw, rad.
@@ -188,8 +189,8 @@ class _Node:
 
 def _parse(text: str, path: str) -> _Node:
     """Return the single top-level list. The parser is iterative, so deep nesting cannot overflow the stack."""
-    found: list[_Node] = []
-    root = _Node(path, line=1, start=0, items=found)
+    top_level: list[_Node] = []
+    root = _Node(path, line=1, start=0, items=top_level)
     stack, line, last = [root], 1, 0
     for match in re.finditer(r"[()]|[^\s()]+", text):
         line += text.count("\n", last, match.start())
@@ -206,10 +207,10 @@ def _parse(text: str, path: str) -> _Node:
             stack.append(node)
     if len(stack) > 1:
         raise stack[-1].error("a '(' that is never closed", "a ')' for it before the end of the file")
-    if len(found) != 1 or found[0].items is None:
-        node = found[1] if len(found) > 1 else (found or [root])[0]
-        raise node.error(str(node) if found else "no text", "exactly one list (define (problem NAME) ...)")
-    return found[0]
+    if len(top_level) != 1 or top_level[0].items is None:
+        node = top_level[1] if len(top_level) > 1 else (top_level or [root])[0]
+        raise node.error(str(node) if top_level else "no text", "exactly one list (define (problem NAME) ...)")
+    return top_level[0]
 
 
 # --- problems ---
@@ -261,7 +262,6 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
 
 
 def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
-    """Return the problem's name and its sections."""
     expected = "(define (problem NAME) ...)"
     head, rest = root.head(expected)
     if head != "define" or not rest:
@@ -410,7 +410,7 @@ def _formula(problem: Problem, node: _Node, depth: int = 0) -> Formula:
 
 def _init(problem: Problem, section: _Node) -> tuple[Atom, ...]:
     """Return the initial state: atoms only, each object placed once, no cycle of supports."""
-    found: list[Atom] = []
+    initial: list[Atom] = []
     support: dict[str, str] = {}
     for node in section.sequence(":init")[1:]:
         head, _ = node.head("an atom such as (On a b)")
@@ -419,14 +419,14 @@ def _init(problem: Problem, section: _Node) -> tuple[Atom, ...]:
             raise node.error(f"{head!r} in :init", f"one of {allowed}")
         atom = _formula(problem, node)
         assert isinstance(atom, Atom)
-        found.append(atom)
+        initial.append(atom)
         if atom.predicate not in ("on", "in"):
             continue
-        thing, place = atom.args
+        thing, target = atom.args
         if thing in support:
             raise node.error(f"a second place for {thing!r}", "one place per object in :init")
-        region = problem.regions.get(place)
-        support[thing] = region.target if region else place
+        region = problem.regions.get(target)
+        support[thing] = region.target if region else target
         if region and not region.ranges and "table" in problem.fixtures.get(region.target, ""):
             raise node.error(
                 f"{thing!r} on region {region.name!r} without :ranges", "a region with :ranges on the table"
@@ -441,4 +441,4 @@ def _init(problem: Problem, section: _Node) -> tuple[Atom, ...]:
                 raise section.error(f"{name!r} resting on itself through {below!r} in :init", "a fixture at the bottom")
             chain.append(below)
             below = support.get(below)
-    return tuple(found)
+    return tuple(initial)

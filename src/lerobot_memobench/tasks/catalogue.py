@@ -69,11 +69,13 @@ def _entries() -> dict[str, _Entry]:
         for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir())
         if (folder / BDDL_FILE).is_file()
     ]
-    found = {each.name: _Entry(each.parents[1].name, each.parent.name, k, each) for k, each in enumerate(folders)}
+    entries = {
+        folder.name: _Entry(folder.parents[1].name, folder.parent.name, k, folder) for k, folder in enumerate(folders)
+    }
     for suite in LIBERO_SUITES:
-        place = LIBERO_FOLDER / f"{suite}.zip"
-        found |= {name: _Entry(suite, suite, k, place / name) for k, name in enumerate(libero_tasks(suite))}
-    return found
+        archive = LIBERO_FOLDER / f"{suite}.zip"
+        entries |= {name: _Entry(suite, suite, k, archive / name) for k, name in enumerate(libero_tasks(suite))}
+    return entries
 
 
 def _entry(name: str) -> _Entry:
@@ -159,9 +161,9 @@ def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
     chosen: list[str] = []
     for word in words:
         if not word:
-            given = "no name" if not spec.strip() else f"an empty entry in {spec!r}"
+            problem = "no name" if not spec.strip() else f"an empty entry in {spec!r}"
             raise MemobenchError(
-                f"found {given} among the tasks; expected 'all', or names, numbers or memory types separated by "
+                f"found {problem} among the tasks; expected 'all', or names, numbers or memory types separated by "
                 "single commas"
             )
         if word == "all" or word in known:
@@ -209,13 +211,14 @@ def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> 
     words = [] if task is None else [word.strip() for word in task.split(",")]
     suites = tuple(dict.fromkeys(words)) if any(word.startswith("libero") for word in words) else (suite,)
     if suites != (suite,):
-        if others := [word for word in words if word in (*SUITES, *MEMORY_TYPES)]:
+        if memory_words := [word for word in words if word in (*SUITES, *MEMORY_TYPES)]:
+            setting = "suite" if memory_words[0] in SUITES else "tasks"
             raise MemobenchError(
-                f"task={task} names suites of LIBERO and {' and '.join(others)}, of memory tasks; run them by two "
-                f"commands, the second with {f'suite={others[0]}' if others[0] in SUITES else f'tasks={others[0]}'}"
+                f"task={task} names suites of LIBERO and {' and '.join(memory_words)}, of memory tasks; run them by "
+                f"two commands, the second with {setting}={memory_words[0]}"
             )
-        for each in suites:
-            check_choice("task", each, LIBERO_SUITES)
+        for name in suites:
+            check_choice("task", name, LIBERO_SUITES)
         if suite not in (PUBLISHED, suites[0]):
             raise MemobenchError(f"task={task} and suite={suite} are both given; leave one of them out")
     elif words and {*words} != {suite}:
@@ -228,7 +231,7 @@ def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> 
         raise MemobenchError(f"task_ids={task_ids} and tasks={tasks} are both given; leave one of them out")
     if not {*suites} <= {*LIBERO_SUITES}:
         raise MemobenchError(f"task_ids={task_ids} are ids of LIBERO's suites, and suite={suite}; name tasks by tasks=")
-    if not isinstance(task_ids, list) or not task_ids or not all(type(each) is int and each >= 0 for each in task_ids):
+    if not isinstance(task_ids, list) or not task_ids or not all(type(k) is int and k >= 0 for k in task_ids):
         raise MemobenchError(f"task_ids is {task_ids!r}; expected ids of LIBERO's tasks in a list, such as [0,1]")
     return suites, ",".join(map(str, task_ids))
 
@@ -259,8 +262,10 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
 
 
 def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
-    classes = dict.fromkeys(instances.values())
-    return {each: [instance for instance, name in instances.items() if name == each] for each in classes}
+    by_class: dict[str, list[str]] = {}
+    for instance, class_name in instances.items():
+        by_class.setdefault(class_name, []).append(instance)
+    return by_class
 
 
 # --- task folders ---
@@ -275,15 +280,15 @@ def find_tasks(folder: str | Path) -> list[Path]:
     root = Path(folder)
     if not root.is_dir():
         raise MemobenchError(f"{root} is not a folder; expected one that holds {BDDL_FILE}, or a tree of such folders")
-    found = [path.parent for path in files_below(root, BDDL_FILE) if path.name.lower() == BDDL_FILE]
-    if not found:
+    task_folders = [path.parent for path in files_below(root, BDDL_FILE) if path.name.lower() == BDDL_FILE]
+    if not task_folders:
         raise MemobenchError(f"found no {BDDL_FILE} in {root} or below it; expected a task in the published format")
-    named: dict[str, Path] = {}
-    for place in found:
-        other = named.setdefault(place.resolve().name, place)
-        if other != place:
-            raise MemobenchError(f"{other} and {place} hold tasks of one name; results are kept by name, so rename one")
-    return found
+    by_name: dict[str, Path] = {}
+    for path in task_folders:
+        other = by_name.setdefault(path.resolve().name, path)  # "." has no name
+        if other != path:
+            raise MemobenchError(f"{other} and {path} hold tasks of one name; results are kept by name, so rename one")
+    return task_folders
 
 
 def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
@@ -359,7 +364,7 @@ def _infer_referent(problem: Problem, checkpoints: tuple[Checkpoint, ...]) -> st
     """
     siblings = Counter(problem.objects.values())
     for formula in (*(checkpoint.goal for checkpoint in checkpoints), problem.goal):
-        named = [arg for atom in atoms(formula) for arg in atom.args if arg in problem.objects]
-        if named:
-            return next((arg for arg in named if siblings[problem.objects[arg]] > 1), named[0])
+        objects = [arg for atom in atoms(formula) for arg in atom.args if arg in problem.objects]
+        if objects:
+            return next((arg for arg in objects if siblings[problem.objects[arg]] > 1), objects[0])
     return None

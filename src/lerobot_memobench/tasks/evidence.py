@@ -29,9 +29,9 @@ def chance(task: Task) -> float | None:
     goals: dict[str, Counter[Formula]] = {}
     for variant in _variants(task):
         goals.setdefault(variant.language, Counter())[variant.goal] += 1
-    if all(len(each) == 1 for each in goals.values()):
+    if all(len(counts) == 1 for counts in goals.values()):
         return None
-    return sum(max(each.values()) for each in goals.values()) / len(task.random_variants)
+    return sum(max(counts.values()) for counts in goals.values()) / len(task.random_variants)
 
 
 def _variants(task: Task) -> list[Task]:
@@ -97,10 +97,10 @@ class Choice:
 
 def handled_atoms(task: Task) -> list[Atom]:
     """Return atoms for the objects lifted and joints moved by a task's checkpoints, in order, without repetitions."""
-    found = []
+    handled = []
     for atom in (atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)):
         if atom.predicate in ("on", "in"):
-            found.append(Atom("lifted", atom.args[:1]))
+            handled.append(Atom("lifted", atom.args[:1]))
         elif atom.predicate in ("open", "turnon"):
-            found.append(Atom("ajar", atom.args))
-    return list(dict.fromkeys(found))
+            handled.append(Atom("ajar", atom.args))
+    return list(dict.fromkeys(handled))

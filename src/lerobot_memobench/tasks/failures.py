@@ -55,14 +55,14 @@ def classify_failure(
     """
     if lost and (spoilt := _spoilt(task, first_steps, lost)) is not None:
         return spoilt
-    found = classify(task.operations, first_steps, success, drift)
-    if found in (None, REFERENCE_DRIFT):
-        return found
+    failure = classify(task.operations, first_steps, success, drift)
+    if failure in (None, REFERENCE_DRIFT):
+        return failure
     if task.memory_type == "procedural" and asks_order(task.goal) and _out_of_order(first_steps):
         return WRONG_ORDER
     if cut_off and (not first_steps or None in first_steps):
         return CUT_OFF
-    return HAND if None in first_steps and _memory_served(task, first_steps, ordered) else found
+    return HAND if None in first_steps and _memory_served(task, first_steps, ordered) else failure
 
 
 def _spoilt(task: Task, first_steps: Sequence[int | None], lost: Formula) -> str | None:
@@ -76,7 +76,7 @@ def _spoilt(task: Task, first_steps: Sequence[int | None], lost: Formula) -> str
     # The earlier event was complete, and only the hand's return was missing.
     before = [part for part in walk(lost) if isinstance(part, Round)]
     complete = [
-        step is not None and any(isinstance(part, Round) and part.children == each.children[:-1] for each in before)
+        step is not None and any(isinstance(part, Round) and part.children == event.children[:-1] for event in before)
         for checkpoint, step in zip(task.checkpoints, first_steps, strict=True)
         for part in walk(checkpoint.goal)
     ]

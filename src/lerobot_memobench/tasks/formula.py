@@ -124,7 +124,7 @@ Formula = Atom | And | Or | Not | Then | Never | Hold | Exactly | When | Round
 
 _OPERATORS = (And, Or, Not, Then, Never, Hold, Exactly, When, Round)
 #: Word (lower case) -> operator; its class's name is the spelling in BDDL.
-OPERATORS: dict[str, type[Formula]] = {made.__name__.lower(): made for made in _OPERATORS}
+OPERATORS: dict[str, type[Formula]] = {operator.__name__.lower(): operator for operator in _OPERATORS}
 
 
 # --- walking ---

@@ -37,20 +37,19 @@ def cue_in_prompt(task: Task, checkpoint: int) -> bool:
 
 def gaps(task: Task) -> tuple[Gap | None, ...]:
     """Return the gap of each checkpoint, () for a task that was not measured; None: nothing has to be remembered."""
-    found: list[Gap | None] = []
-    for k, row in enumerate(_measured().get(task.name, [])):
-        held = task.suite == STRICT and cue_in_prompt(task, k)
-        found.append(None if row is None else Gap(row[0], row[1], row[2], held))
-    return tuple(found)
+    rows = _measured().get(task.name, [])
+    return tuple(
+        None if row is None else Gap(row[0], row[1], row[2], held=task.suite == STRICT and cue_in_prompt(task, k))
+        for k, row in enumerate(rows)
+    )
 
 
 def longest_gap(task: Task) -> Gap | None:
     """Return the largest median gap of a task's checkpoints; None for a task without one or not measured."""
-    found = [gap for gap in gaps(task) if gap is not None]
-    return max(found, key=lambda gap: (gap.held, gap.median), default=None)
+    return max((gap for gap in gaps(task) if gap is not None), key=lambda gap: (gap.held, gap.median), default=None)
 
 
 @cache
 def _measured() -> dict[str, list[list[int] | None]]:
-    found: dict[str, list[list[int] | None]] = json.loads(GAPS_FILE.read_text())
-    return found
+    rows: dict[str, list[list[int] | None]] = json.loads(GAPS_FILE.read_text())
+    return rows

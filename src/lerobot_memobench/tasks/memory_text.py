@@ -85,13 +85,13 @@ def _subtask(text: str, before: str) -> str:
         text = _expand_first_match(_LEFT, whole)
     elif counted:
         text = f"{whole} for the {_TIMES[counted[2]]} time"
-    return _VERB.sub(lambda found: IMPERATIVES[found[1]], _expand_first_match(_SUMS, text))
+    return _VERB.sub(lambda match: IMPERATIVES[match[1]], _expand_first_match(_SUMS, text))
 
 
 def _expand_first_match(patterns: Sequence[tuple[str, str]], text: str) -> str:
     """Return the expansion of the first matching pattern, else the text unchanged."""
     for pattern, template in patterns:
-        found = re.fullmatch(pattern, text)
-        if found:
-            return found.expand(template)
+        match = re.fullmatch(pattern, text)
+        if match:
+            return match.expand(template)
     return text

@@ -90,12 +90,8 @@ class MetadataFile(TypedDict):
 class Metadata:
     """Content of a metadata file; its methods raise `MemobenchError` with file and key.
 
-    Args:
-        path: path of the file; None for a task without metadata, which has no checkpoints.
-        problem: BDDL problem of the same folder, which declares the names.
-
-    Attributes:
-        data: content of the file, a `MetadataFile` or {}.
+    ``path``: None for a task without metadata, which has no checkpoints. ``problem``: BDDL problem of the same folder,
+    which declares the names. ``data``: a `MetadataFile`, or {}.
     """
 
     def __init__(self, path: Path | None, problem: Problem) -> None:

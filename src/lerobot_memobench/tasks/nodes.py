@@ -110,8 +110,8 @@ class _AndNode(_Node):
 
     @property
     def settled(self) -> bool | None:
-        found = [part.settled for part in self.parts]
-        return False if False in found else None if None in found else True
+        values = [part.settled for part in self.parts]
+        return False if False in values else None if None in values else True
 
 
 class _OrNode(_Node):
@@ -121,8 +121,8 @@ class _OrNode(_Node):
 
     @property
     def settled(self) -> bool | None:
-        found = [part.settled for part in self.parts]
-        return True if True in found else None if None in found else False
+        values = [part.settled for part in self.parts]
+        return True if True in values else None if None in values else False
 
 
 class _NotNode(_Node):
@@ -131,8 +131,8 @@ class _NotNode(_Node):
 
     @property
     def settled(self) -> bool | None:
-        found = self.parts[0].settled
-        return None if found is None else not found
+        value = self.parts[0].settled
+        return None if value is None else not value
 
 
 # --- Never, Hold, Exactly: durations and counts ---
@@ -162,8 +162,8 @@ class _HoldNode(_Node):
 
     @property
     def settled(self) -> bool | None:
-        found = self.parts[0].settled
-        return None if found and self.held < self.number else found
+        value = self.parts[0].settled
+        return None if value and self.held < self.number else value
 
 
 class _ExactlyNode(_Node):
@@ -182,8 +182,8 @@ class _ExactlyNode(_Node):
     def settled(self) -> bool | None:
         if self.count > self.number:
             return False
-        found = self.parts[0].settled
-        return self.count == self.number if found is not None and found == self.before else None
+        value = self.parts[0].settled
+        return self.count == self.number if value is not None and value == self.before else None
 
 
 # --- Then, Round, When: order of events ---

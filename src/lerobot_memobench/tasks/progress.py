@@ -60,7 +60,7 @@ class Evaluator:
         formula, node = self.formulas[k], self._nodes[k]
         if not isinstance(formula, And):
             return [(formula, node.settled)]
-        return [(part, each.settled) for part, each in zip(children(formula), node.parts, strict=True)]
+        return [(part, child.settled) for part, child in zip(children(formula), node.parts, strict=True)]
 
     def step(self, holds: Callable[[Atom], bool]) -> tuple[bool, ...]:
         """Evaluate one control step and return the value of each formula.
@@ -128,8 +128,8 @@ class Progress:
     @property
     def ordered(self) -> bool:
         """Whether the goal asks for an order of events, and each event has begun in this order."""
-        found = [settled for part, settled in self._evaluator.parts(0) if isinstance(part, When)]
-        return bool(found) and all(found)
+        begun = [settled for part, settled in self._evaluator.parts(0) if isinstance(part, When)]
+        return bool(begun) and all(begun)
 
     @property
     def lost(self) -> bool:

@@ -132,9 +132,7 @@ class Task:
     Attributes:
         memory_type: temporal, spatial, object or procedural; the suite for a task of LIBERO's suites, which LeRobot
             reports by suite.
-        family: group of similar tasks.
-        objects: instance -> class, in the file's order.
-        fixtures: instance -> class, in the file's order.
+        objects, fixtures: instance -> class, in the file's order.
         regions: full name (``<target>_<region>``) -> region.
         init: initial state; objects in regions are sampled, others rest on their support.
         prompt: None for the published temporal and spatial tasks.
