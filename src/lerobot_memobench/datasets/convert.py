@@ -264,8 +264,8 @@ def inspect(file: SourceFile) -> Findings:
         findings.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
 
     def note(reason: str) -> None:
-        one = ConversionNote(file=file.name, group="", reason=reason)
-        findings.notes += [one] * (one not in findings.notes)
+        entry = ConversionNote(file=file.name, group="", reason=reason)
+        findings.notes += [entry] * (entry not in findings.notes)
 
     try:
         with PublishedFile(file.path) as opened, unusable_on_error():

@@ -223,15 +223,15 @@ def persistent_rows(columns: Labels) -> list[LanguageRow]:
 
 
 def _changes(texts: list[str]) -> list[tuple[int, str]]:
-    kept: list[tuple[int, str]] = []
+    changes: list[tuple[int, str]] = []
     for frame, text in enumerate(texts):
         if not text or (frame > 0 and text == texts[frame - 1]):
             continue
-        if kept and frame - kept[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
-            replaced, _ = kept.pop()
+        if changes and frame - changes[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
+            replaced, _ = changes.pop()
             frame = 0 if replaced == 0 else frame  # a text must be active from the first frame on
-        kept.append((frame, text))
-    return kept
+        changes.append((frame, text))
+    return changes
 
 
 def _row(style: str, text: str, frame: int) -> LanguageRow:

@@ -84,8 +84,10 @@ class StagedEpisode(BaseModel):
 
     def camera_stats(self) -> dict[str, Stats]:
         """Return the statistics of each camera's pixels by the name of its column."""
-        stats = self.image_stats.items()
-        return {image_key(camera): {name: np.array(value) for name, value in one.items()} for camera, one in stats}
+        return {
+            image_key(camera): {name: np.array(value) for name, value in stats.items()}
+            for camera, stats in self.image_stats.items()
+        }
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
