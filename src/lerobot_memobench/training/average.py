@@ -38,7 +38,7 @@ class WeightAverage:
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
         self.decay, self.parameters = decay, dict(parameters)
         self.counts = dict.fromkeys(self.parameters, 0)
-        self.average = {name: one.detach().to(torch.float32, copy=True) for name, one in self.parameters.items()}
+        self.average = {name: weight.detach().to(torch.float32, copy=True) for name, weight in self.parameters.items()}
 
     @torch.no_grad()
     def update(self) -> None:
@@ -73,9 +73,9 @@ class WeightAverage:
             if parameter.dtype != torch.float32:
                 tensors[f"average.{name}"] = self.average[name]
         longest = max(self.counts.values(), default=0)
-        others = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
+        other_counts = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
         folder.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **others})
+        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **other_counts})
 
     @torch.no_grad()
     def restore(self, path: Path, names: Collection[str]) -> list[str]:
@@ -90,8 +90,8 @@ class WeightAverage:
         with undamaged_tensors(path), safe_open(path, framework="pt") as file:
             metadata = file.metadata()
         tensors: Mapping[str, Tensor] = read_tensors(path)
-        found = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
-        for name, weights in found.items():
+        saved = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
+        for name, weights in saved.items():
             parameter = self.parameters[name]
             if weights.shape != parameter.shape:
                 raise MemobenchError(
@@ -101,7 +101,7 @@ class WeightAverage:
             self.average[name] = average.to(parameter.device, torch.float32, copy=True)
             self.counts[name] = int(metadata.get(f"updates.{name}", metadata["updates"]))
             parameter.copy_(weights.to(parameter.device))
-        return [name for name in self.parameters if name not in found]
+        return [name for name in self.parameters if name not in saved]
 
 
 def begin_average(policy: Any) -> WeightAverage | None:
