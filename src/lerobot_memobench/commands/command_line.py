@@ -76,10 +76,7 @@ OPTIONS = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}
 def parse_words(line: Sequence[str]) -> dict[str, str]:
     """Return key -> text of ``key=value``, ``--key=value`` and ``--key value``; ``--flag`` is ``true``.
 
-    Of a repeated key the last value counts.
-
-    Raises:
-        MemobenchError: a word has none of these forms.
+    Of a repeated key the last value counts; a word of another form is refused.
     """
     words: dict[str, str] = {}
     open_flag: str | None = None  # the previous word was `--flag` without `=`: this word may be its value
@@ -112,10 +109,7 @@ def without[T](words: Mapping[str, T], *keys: str) -> dict[str, T]:
 def check_names(command: str, words: Collection[str]) -> None:
     """Refuse mistyped names without a dot, also before LeRobot is imported, which takes eight seconds.
 
-    LeRobot's own names are read from the source of its configuration.
-
-    Raises:
-        MemobenchError: a name is unknown; it names the nearest known one.
+    LeRobot's own names are read from the source of its configuration. The error names the nearest known one.
     """
     source = Path(str(metadata.distribution("lerobot").locate_file(f"lerobot/configs/{command}.py")))
     if source.is_file():
@@ -172,11 +166,7 @@ class CommandSettings:
         return replace(self, file=merged(nested({key: value}), self.file))
 
     def build(self) -> Any:
-        """Return the configuration; that of a checkpoint beneath it is downloaded if it is in a repository.
-
-        Raises:
-            MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
-        """
+        """Return the configuration; download that of a checkpoint in a repository. Errors as of `build_config`."""
         return build_config(self.config, self.settings)
 
     def build_field(self, name: str) -> Any:
@@ -249,11 +239,7 @@ def _without_field(requested: CommandSettings, key: str, full: str) -> Memobench
 
 
 def nested(words: Mapping[str, Any]) -> Settings:
-    """Return ``policy.align`` -> value as ``{"policy": {"align": value}}``.
-
-    Raises:
-        MemobenchError: a section is given a value of its own.
-    """
+    """Return ``policy.align`` -> value as ``{"policy": {"align": value}}``; refuse values of a section itself."""
     settings: Settings = {}
     for key, value in words.items():
         *sections, last = key.split(".")
@@ -284,11 +270,7 @@ def merged(*layers: Mapping[str, Any]) -> Settings:
 
 
 def choice_settings(config: type, key: str, value: str) -> dict[str, str]:
-    """Return the settings for a choice such as ``policy=``, of a command with this configuration.
-
-    Raises:
-        MemobenchError: it does not exist, with near names.
-    """
+    """Return the settings for a choice such as ``policy=``; the error of an unknown one has near names."""
     if not value:
         raise MemobenchError(f"{key}= is empty; expected a name")
     if key == DATASET:
@@ -336,11 +318,7 @@ def dataset_settings(value: str) -> dict[str, str]:
 def chosen_class(kind: Any, name: str, section: Mapping[str, Any]) -> type | None:
     """Return the class that the settings of a choice name, by ``path`` or ``type``; None without one.
 
-    Args:
-        kind: base class of the choice. name: of the choice, for messages.
-
-    Raises:
-        MemobenchError: there is none of this name.
+    ``kind`` is the base class, ``name`` that of the choice in messages. An unregistered type is refused.
     """
     known = registered(kind)
     chosen = section.get(TYPE)
@@ -397,11 +375,7 @@ def recipes() -> dict[str, Path]:
 
 
 def recipe_file(value: str) -> Path:
-    """Return the file of a recipe: a shipped recipe by its name, or a YAML or JSON file; ``./name`` is a file.
-
-    Raises:
-        MemobenchError: it does not exist.
-    """
+    """Return the existing file of a recipe: a shipped one by its name, else YAML or JSON; ``./name`` is a file."""
     known = recipes()
     path = Path(value).expanduser()
     if value in known:
@@ -423,11 +397,7 @@ def resolve_recipe(words: Mapping[str, str]) -> dict[str, str]:
 
 
 def read_config_file(config_path: str | None) -> Settings:
-    """Return the content of the local file that ``config_path`` names, {} without one.
-
-    Raises:
-        MemobenchError: it cannot be read as settings.
-    """
+    """Return the content of the local file ``config_path``, {} without one; refuse other content than settings."""
     if config_path is None:
         return {}
     path = Path(config_path).expanduser()
@@ -475,11 +445,7 @@ NULLS = ("null", "~")
 def build_config(annotation: Any, settings: Any, key: str = "") -> Any:
     """Return the configuration of a class with these settings, or the value of a field.
 
-    Args:
-        key: name of the field or section, for messages; "" for the configuration of a command.
-
-    Raises:
-        MemobenchError: as of `value_of`, or the configuration's own.
+    ``key`` names field or section in messages, "" a command. Errors are those of `value_of` and the configuration's.
     """
     value = value_of(key, annotation, settings)
     try:
@@ -505,10 +471,8 @@ def _explained(error: Exception, key: str) -> MemobenchError:
 def typed(kind: Any, settings: Mapping[str, Any], before: str = "") -> Settings:
     """Return nested settings with values of the types of a class's fields instead of texts.
 
-    A choice's ``path`` is replaced by the settings of that checkpoint, which the given ones override.
-
-    Raises:
-        MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
+    A choice's ``path`` is replaced by the settings of that checkpoint, which the given ones override. An unknown name
+    (the error has the nearest one) and an impossible value are refused.
     """
     beneath: Settings = {}
     if is_choice_type(kind):
@@ -536,11 +500,7 @@ def given_values(kind: Any, settings: Mapping[str, Any], before: str) -> Setting
 
 
 def value_of(key: str, annotation: Any, value: Any) -> Any:
-    """Return a value of a field's type for a text; the values of files stay as they are.
-
-    Raises:
-        MemobenchError: the field cannot have this value.
-    """
+    """Return a value of a field's type for a text, or refuse it; the values of files stay as they are."""
     kind = without_none(annotation)
     is_section = dataclasses.is_dataclass(kind) or is_choice_type(kind)
     if is_section and value in NULLS:
@@ -635,11 +595,7 @@ def registries(config: type) -> dict[str, dict[str, type]]:
 
 
 def policy_config(requested: CommandSettings) -> PreTrainedConfig | None:
-    """Return the configuration of the policy, None without one.
-
-    Raises:
-        MemobenchError: the checkpoint is not complete, or as of `build_config`.
-    """
+    """Return the configuration of the policy, None without one; refuse an incomplete checkpoint."""
     if (path := requested.get(f"policy.{PATH}")) is not None:
         check_checkpoint(path)
     config: PreTrainedConfig | None = requested.build_field("policy")

@@ -258,12 +258,8 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[Path]:
     """Write the card's tables and the hash of each episode of the dataset in ``folder`` to ``out``; return the files.
 
-    Episodes of other programs are left out. ``notify`` is called with messages about them, and about parts that other
-    tools have removed from the dataset.
-
-    Raises:
-        MemobenchError: the folder is no dataset, one of its files is truncated (see `check_whole`), or none of its
-            episodes is one of this benchmark.
+    Episodes of other programs are left out; a dataset without others is refused, and a damaged one (`check_whole`).
+    ``notify`` is called with messages about them, and about parts that other tools have removed from the dataset.
     """
     with undamaged(folder):
         episodes = list_episodes(folder)

@@ -461,10 +461,8 @@ def check_whole(folder: Path) -> None:
     """Check that a dataset has all of its frames, at the places that its metadata names, without decoding videos.
 
     The check covers ends and row counts of tables, totals, numbers of tasks, bounds and files of episodes, the
-    numbering of frames, and boxes and frame counts of videos.
-
-    Raises:
-        MemobenchError: naming the first truncated or missing file, or the first number that differs.
+    numbering of frames, and boxes and frame counts of videos. The error names the first truncated or missing file, or
+    the first number that differs.
     """
     with undamaged(folder):
         _check_bounds(folder, read_info(folder))

@@ -57,11 +57,7 @@ class FrameTable:
 
 
 def read_frame_table(root: Path) -> FrameTable:
-    """Read phase, holds and subgoals of every frame.
-
-    Raises:
-        MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
-    """
+    """Read phase, holds and subgoals of every frame; refuse frames not numbered 0, 1, 2, ... episode by episode."""
     wanted = {*_PLACE, OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
     table = read_table(root / "data", wanted.__contains__).sort_by("index")
     names = {*table.column_names}

@@ -200,10 +200,8 @@ def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None],
 
     Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
 
-    Args:
-        size: approximate bytes of the dataset; ``staged`` of them exist already.
-        work: amount of work, which begins the message.
-        extra: bytes of temporary files.
+    ``size`` is the dataset's, approximately, ``staged`` of it exists already, ``extra`` is that of temporary files, all
+    in bytes; ``work`` begins the message.
     """
     free, most = free_bytes(out), max(2 * size - staged, 0) + extra
     sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"

@@ -76,8 +76,7 @@ class PublishedDemo:
 class PublishedFile:
     """A file in the published layout; a context.
 
-    Raises:
-        Unusable: naming the first difference to the layout. Raised on opening it concerns the file, by `read` a group.
+    `Unusable` names the first difference to the layout: on opening it concerns the file, by `read` a group.
     """
 
     def __init__(self, path: Path) -> None:

@@ -304,10 +304,7 @@ def check_destination(out: Path) -> None:
 def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
     """Lock the destination ``out`` for a run with ``request``; yield the folder of its finished episodes.
 
-    Episodes of an unfinished run of the same request are kept.
-
-    Raises:
-        MemobenchError: another run is writing there, or an unfinished run has another request.
+    Episodes of an unfinished run of the same request are kept. Another request, and a run that goes on, are refused.
     """
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)

@@ -52,11 +52,7 @@ class WeightAverage:
 
     @contextmanager
     def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
-        """Set the module's parameters to the average inside the block; float32 parameters are not copied.
-
-        Args:
-            dtypes: parameters whose precision changes too.
-        """
+        """Set the parameters to the average inside the block, some in other ``dtypes``; float32 ones are not copied."""
         trained = {name: parameter.data for name, parameter in self.parameters.items()}
         try:
             for name, parameter in self.parameters.items():
@@ -81,11 +77,8 @@ class WeightAverage:
     def restore(self, path: Path, names: Collection[str]) -> list[str]:
         """Restore weights, averages and numbers of updates of these parameters in a module that holds the average.
 
-        Returns:
-            Names of parameters without a saved state; their average starts at their present weights.
-
-        Raises:
-            MemobenchError: the file cannot be read, or does not fit.
+        Return the parameters without a saved state, whose average starts at their present weights. A file that cannot
+        be read, or does not fit, is refused.
         """
         with undamaged_tensors(path), safe_open(path, framework="pt") as file:
             metadata = file.metadata()
@@ -109,9 +102,6 @@ def begin_average(policy: Any) -> WeightAverage | None:
 
     A policy loaded from a checkpoint holds the average. Its trained weights are restored, and the average continues;
     for parts that are initialised again, or that the checkpoint did not train, it starts at their weights.
-
-    Raises:
-        MemobenchError: the checkpoint's trained weights cannot be read, or do not fit.
     """
     config = policy.config
     if not config.ema_decay or config.use_peft:

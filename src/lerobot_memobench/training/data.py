@@ -109,11 +109,7 @@ class Training:
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
-    """Make or load the policy of a training, compute missing features, and make the processors.
-
-    Raises:
-        MemobenchError: the dataset does not fit the policy.
-    """
+    """Make or load the policy of a training, compute missing features, and make the processors."""
     dataset, held_out = datasets
     policy_config: Any = config.policy
     set_subgoals(policy_config, dataset.meta)
@@ -129,11 +125,7 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
 
 
 def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-    """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
-
-    Raises:
-        MemobenchError: the dataset lacks an episode, or another version made it.
-    """
+    """Open episodes to train on and held-out ones like LeRobot, with statistics. Errors as of `open_metadata`."""
     opened = copy.copy(config)
     opened.dataset = replace(config.dataset)
     complete_statistics(config.policy, open_metadata(opened.dataset), opened.dataset)
@@ -222,11 +214,7 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
 def open_lookup(
     root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
 ) -> FrameLookup:
-    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first.
-
-    Raises:
-        MemobenchError: the dataset lacks a column, or features cannot be computed.
-    """
+    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first."""
     in_data = {known: name for name, known in (renamed or {}).items()}
     columns: dict[str, Tensor] = {}
     encoded: dict[str, Encoded] = {}
@@ -274,11 +262,7 @@ def open_lookup(
 
 
 def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Set the subgoals of a memory that learns from texts, and check that the dataset has all texts of the policy.
-
-    Raises:
-        MemobenchError: the dataset lacks texts, or has some that the memory does not know.
-    """
+    """Set the subgoals of a memory that learns from texts; refuse a dataset that lacks texts, or has unknown ones."""
     if config.align == NONE and not config.oracle_memory and not config.privileged_memory:
         return
     table, level = read_frame_table(Path(meta.root)), config.subgoal_level
@@ -319,8 +303,7 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
 def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> FrameTable:
     """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals.
 
-    Raises:
-        MemobenchError: there is a single text to shuffle, or an episode's task is unknown.
+    A single text to shuffle and an episode of an unknown task are refused.
     """
     level, texts = config.subgoal_level, table.subgoals.get(config.subgoal_level, [])
     if config.align == NONE or not any(texts):

@@ -86,8 +86,7 @@ def seed_of(*numbers: int, dtype: type[np.uint32 | np.uint64] = np.uint32) -> in
 def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
     """Return a random order of 0 ... N - 1 in which ``together`` entries of an episode are in a row.
 
-    Args:
-        ends: (E,) end of each episode's entries; the last is N.
+    ``ends`` (E,) are the ends of the episodes' entries; the last is N.
     """
     lengths = torch.from_numpy(np.diff(ends, prepend=0))
     episode = torch.repeat_interleave(lengths)

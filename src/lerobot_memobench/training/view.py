@@ -69,11 +69,7 @@ class ViewOptions:
     convention: str | None = None
 
     def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
-        """Return the view's columns: name in the dataset -> name in the view.
-
-        Raises:
-            MemobenchError: the dataset lacks the observations.
-        """
+        """Return name in the dataset -> name in the view; refuse a dataset that lacks the observations."""
         cameras = cameras_of(features)
         objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
         dropped = set() if self.prompts else {*CLOCK}
@@ -94,11 +90,7 @@ class ViewOptions:
         return {name: renamed.get(name, name) for name in features if name not in dropped}
 
     def mirrors(self, features: Mapping[str, Any]) -> bool:
-        """Return whether the view's pictures are those of the dataset, mirrored left to right.
-
-        Raises:
-            MemobenchError: the view has no pictures, or the dataset's convention is unknown.
-        """
+        """Return whether the view mirrors pictures left to right; refuse a view without, or an unknown convention."""
         if self.convention is None:
             return False
         cameras, convention = cameras_of(features), convention_of(features)
