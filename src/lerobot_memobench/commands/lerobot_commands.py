@@ -75,7 +75,7 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.sim.convention import MIRRORED
 
-    name = Path(sys.argv[0]).name.replace("_", "-")
+    name = Path(sys.argv[0]).name.replace("_", "-")  # `lerobot-eval`, or `lerobot_eval.py` of `python -m`
     command = next((choice for choice in ("train", "eval") if name.startswith(f"{PREFIX}{choice}")), None)
     if command is None:
         return None, UNKNOWN_POLICY

@@ -259,7 +259,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
     """Write the card's tables and the hash of each episode of the dataset in ``folder`` to ``out``; return the files.
 
     Episodes of other programs are left out; a dataset without others is refused, and a damaged one (`check_whole`).
-    ``notify`` is called with messages about them, and about parts that other tools have removed from the dataset.
+    ``notify`` is called with messages about left-out episodes, and about parts that other tools have removed.
     """
     with undamaged(folder):
         episodes = list_episodes(folder)

@@ -188,7 +188,7 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Con
     files, refused = [], []
     if source.is_file() and source.suffix.lower() == ".zip":
         for info in _entries(source):
-            try:
+            try:  # a part such as `..` would lead to another folder
                 name = "/".join(file_name(part, "a part of its name") for part in info.filename.split("/"))
             except MemobenchError as error:
                 printable = "".join(letter if letter.isprintable() else "?" for letter in info.filename)[:200]

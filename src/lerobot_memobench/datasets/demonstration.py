@@ -271,7 +271,7 @@ def digest(demo: Demonstration) -> str:
     columns: Labels = {"states": demo.states, "actions": demo.actions, "key_frames": key_frames(demo)}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    if demo.held is not None and demo.held.any():
+    if demo.held is not None and demo.held.any():  # the column changes no hash of an episode without holds
         columns["held"] = demo.held
     columns |= {name: frame_labels[column] for name, column in HASHED.items()}
     columns["phase"] = frame_labels[OBS_PHASE].astype(np.int64)

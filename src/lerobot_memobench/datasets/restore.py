@@ -253,6 +253,7 @@ def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
     for index in range(model.njnt):
         joint = model.joint(index)
         kind = JOINT_TYPES[int(joint.type[0])]
+        # A state begins with the time.
         position, velocity = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
         nq, nv = WIDTHS[kind]
         body = model.body(int(joint.bodyid[0])).name
@@ -302,7 +303,7 @@ def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> No
             )
         attributes = {key: element.attrib[key] for key in ("name", *KEPT[tag]) if key in element.attrib}
         copy = ElementTree.SubElement(target, tag, attributes)
-        if tag == "body":
+        if tag == "body":  # MuJoCo compiles no moving body without a mass, and its geoms are left out
             ElementTree.SubElement(copy, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
             _copy_bodies(element, copy)
 

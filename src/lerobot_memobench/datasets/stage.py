@@ -265,6 +265,7 @@ def _temporary_folder(folder: Path) -> Path:
 
     Killed workers leave such folders, which are removed with the staging folder.
     """
+    # Two workers may make the same episode, so each has a name of its own.
     temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
     temporary.mkdir(parents=True)
     return temporary

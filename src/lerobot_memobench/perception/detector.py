@@ -134,7 +134,7 @@ class FeaturePyramid(nn.Module):
     def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
         """Return (N, (GRID FINER)², width), row by row."""
         x = tokens.unflatten(1, (GRID, GRID))
-        for level, lateral in zip(self.levels, reversed(maps), strict=False):
+        for level, lateral in zip(self.levels, reversed(maps), strict=False):  # the finest maps are left over
             x = level(x, lateral)
         return x.flatten(1, 2)
 

@@ -89,6 +89,7 @@ def projected(positions: Array, view: View) -> tuple[Array, Array]:
     """
     local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
     depth = -local[..., 2]
+    # Points in the camera's plane have no place; the bound keeps theirs finite.
     reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
     return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
 

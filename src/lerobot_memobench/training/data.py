@@ -341,7 +341,7 @@ class DecodedSamples(Dataset[dict[str, Any]]):
     def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
         index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
         with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed_of(self._seed, number, 0, 0))
+            torch.manual_seed(seed_of(self._seed, number, 0, 0))  # augmentations draw from torch's generator
             sample: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
         sample[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
         return sample

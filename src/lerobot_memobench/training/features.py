@@ -285,7 +285,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
         weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
             random weights of a fixed seed.
     """
-    with torch.device("meta"):
+    with torch.device("meta"):  # the language model's weights are never allocated
         model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
     tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)

@@ -114,7 +114,7 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
     """Return accelerate's handle of this process, after seeding and settings as in LeRobot's trainer."""
     policy: Any = config.policy
     accelerator = Accelerator(
-        step_scheduler_with_optimizer=False,
+        step_scheduler_with_optimizer=False,  # else accelerate steps the schedule once for each process
         mixed_precision={"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(policy.dtype),
         kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
         cpu=policy.device == "cpu",

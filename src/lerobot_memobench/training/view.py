@@ -194,7 +194,7 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
         stats = {columns[name]: values for name, values in recorded(root).items() if name in columns}
         write_file(build / STATS_FILE, json.dumps(stats))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
-        build.rename(out)
+        build.rename(out)  # complete at once: `cached_view` uses a view that exists
 
 
 class Stretches(NamedTuple):
