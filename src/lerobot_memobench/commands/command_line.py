@@ -48,7 +48,7 @@ PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
 HELP = "help"
 
 OF_POLICY = ("align", "size", "perception", "detector", "visual_encoder", "device")
-OF_ENVIRONMENT = ("tasks", "task", "task_ids", *(each.name for each in fields(EnvSettings)))
+OF_ENVIRONMENT = ("tasks", "task", "task_ids", *(setting.name for setting in fields(EnvSettings)))
 COMMON: dict[str, tuple[str, ...]] = {
     **{key: (f"policy.{key}",) for key in OF_POLICY},
     **{key: (f"env.{key}",) for key in OF_ENVIRONMENT},
@@ -76,12 +76,9 @@ OPTIONS = {"eval": RUN_OPTIONS, "train": TRAINING_OPTIONS}
 def parse_words(line: Sequence[str]) -> dict[str, str]:
     """Return key -> text of ``key=value``, ``--key=value`` and ``--key value``; ``--flag`` is ``true``.
 
-    Of a repeated key the last value counts.
-
-    Raises:
-        MemobenchError: a word has none of these forms.
+    Of a repeated key the last value counts; a word of another form is refused.
     """
-    found: dict[str, str] = {}
+    words: dict[str, str] = {}
     open_flag: str | None = None  # the previous word was `--flag` without `=`: this word may be its value
     for word in line:
         key, equals, value = word.removeprefix("--").partition("=")
@@ -94,9 +91,9 @@ def parse_words(line: Sequence[str]) -> dict[str, str]:
                 raise MemobenchError(f"found {word!r} among the arguments; expected key=value or --flag=value")
             key, value = open_flag, word
         open_flag = key if word.startswith("--") and not equals else None
-        found.pop(key, None)  # the order of keys is that of their last values
-        found[key] = value
-    return found
+        words.pop(key, None)  # the order of keys is that of their last values
+        words[key] = value
+    return words
 
 
 def as_command_line(words: Mapping[str, Any]) -> list[str]:
@@ -112,10 +109,7 @@ def without[T](words: Mapping[str, T], *keys: str) -> dict[str, T]:
 def check_names(command: str, words: Collection[str]) -> None:
     """Refuse mistyped names without a dot, also before LeRobot is imported, which takes eight seconds.
 
-    LeRobot's own names are read from the source of its configuration.
-
-    Raises:
-        MemobenchError: a name is unknown; it names the nearest known one.
+    LeRobot's own names are read from the source of its configuration. The error names the nearest known one.
     """
     source = Path(str(metadata.distribution("lerobot").locate_file(f"lerobot/configs/{command}.py")))
     if source.is_file():
@@ -162,27 +156,23 @@ class CommandSettings:
 
     def get(self, key: str) -> Any:
         """Return the text or value of a setting, None without one."""
-        found: Any = self.settings
+        value: Any = self.settings
         for part in key.split("."):
-            found = found.get(part) if isinstance(found, Mapping) else None
-        return found
+            value = value.get(part) if isinstance(value, Mapping) else None
+        return value
 
     def default(self, key: str, value: object) -> CommandSettings:
         """Return settings with a value, unless one is given."""
         return replace(self, file=merged(nested({key: value}), self.file))
 
     def build(self) -> Any:
-        """Return the configuration; that of a checkpoint beneath it is downloaded if it is in a repository.
-
-        Raises:
-            MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
-        """
+        """Return the configuration; download that of a checkpoint in a repository. Errors as of `build_config`."""
         return build_config(self.config, self.settings)
 
     def build_field(self, name: str) -> Any:
         """Return the value of a field of the configuration, None where it is not given. Errors as of `build_config`."""
-        given = self.settings.get(name)
-        return None if given is None else build_config(field_types(self.config)[name], given, name)
+        value = self.settings.get(name)
+        return None if value is None else build_config(field_types(self.config)[name], value, name)
 
 
 def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
@@ -200,64 +190,60 @@ def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
     config_path = words.get(CONFIG_FILE)
     begun = _begun_training(config, config_path)
     file = read_config_file(config_path) if begun is None else draccus.encode(begun)
-    found: dict[str, Any] = {}
+    resolved: dict[str, Any] = {}
     for key in choices:  # `policy: act` in a file is `policy=act`
         if isinstance(file.get(key), str):
             file[key] = nested(choice_settings(config, key, file[key]))[key]
     for key, value in words.items():
         if key in choices or (key == DATASET and DATASET in field_types(config)):
-            found = without(found, f"{key}.{TYPE}", f"{key}.{PATH}") | choice_settings(config, key, value)
+            resolved = without(resolved, f"{key}.{TYPE}", f"{key}.{PATH}") | choice_settings(config, key, value)
         elif not key.endswith(f".{PACKAGES}") and key not in (CONFIG_FILE, HELP):
-            found[key] = value
+            resolved[key] = value
     for key in choices:
-        named = {name: found[option] for name in (TYPE, PATH) if (option := f"{key}.{name}") in found}
-        there = file.get(key)
-        if named and isinstance(there, Mapping) and {TYPE, PATH} & {*there} and not named.items() <= there.items():
+        choice = {name: resolved[option] for name in (TYPE, PATH) if (option := f"{key}.{name}") in resolved}
+        stored = file.get(key)
+        if choice and isinstance(stored, Mapping) and {TYPE, PATH} & {*stored} and not choice.items() <= stored.items():
             del file[key]  # settings of another choice
-    if "dataset.repo_id" in found and isinstance(file.get(DATASET), Mapping):
+    if "dataset.repo_id" in resolved and isinstance(file.get(DATASET), Mapping):
         file[DATASET] = without(file[DATASET], "root", "repo_id")
-    check_names(command, found)
-    asked, short = CommandSettings(config, found, file, config_path, begun), SHORT_FORMS[command]
+    check_names(command, resolved)
+    requested, short = CommandSettings(config, resolved, file, config_path, begun), SHORT_FORMS[command]
     full: dict[str, Any] = {}
-    for key, value in found.items():
+    for key, value in resolved.items():
         if key not in short or key in field_types(config):
             full[key] = value
             continue
         # replan= sets the policy's interval and the environment's, for the log; either may not exist.
-        kinds = {name: kind for name in short[key] if (kind := setting_kind(asked, name)) is not None}
+        kinds = {name: kind for name in short[key] if (kind := setting_kind(requested, name)) is not None}
         if not kinds:
-            raise _without_field(asked, key, short[key][0])
+            raise _without_field(requested, key, short[key][0])
         full |= {name: value_of(key, kind, value) for name, kind in kinds.items()}
-    return replace(asked, words=full)
+    return replace(requested, words=full)
 
 
-def setting_kind(asked: CommandSettings, key: str) -> Any:
+def setting_kind(requested: CommandSettings, key: str) -> Any:
     """Return the type of a setting of this full name, None where the choices that are made have none."""
     section, _, name = key.partition(".")
-    kind = without_none(field_types(asked.config)[section])
-    chosen = chosen_class(kind, section, asked.get(section) or {}) if is_choice_type(kind) else kind
+    kind = without_none(field_types(requested.config)[section])
+    chosen = chosen_class(kind, section, requested.get(section) or {}) if is_choice_type(kind) else kind
     return None if chosen is None else field_types(chosen).get(name)
 
 
-def _without_field(asked: CommandSettings, key: str, full: str) -> MemobenchError:
+def _without_field(requested: CommandSettings, key: str, full: str) -> MemobenchError:
     section, _, name = full.partition(".")
-    kind = without_none(field_types(asked.config)[section])
-    chosen = chosen_class(kind, section, asked.get(section) or {})
+    kind = without_none(field_types(requested.config)[section])
+    chosen = chosen_class(kind, section, requested.get(section) or {})
     if chosen is not None:
         return MemobenchError(f"{key}= sets {full}, and {chosen.__name__} has no such field")
     return MemobenchError(f"{key}= sets {name} of the {section}: name one with {section}=")
 
 
 def nested(words: Mapping[str, Any]) -> Settings:
-    """Return ``policy.align`` -> value as ``{"policy": {"align": value}}``.
-
-    Raises:
-        MemobenchError: a section is given a value of its own.
-    """
-    found: Settings = {}
+    """Return ``policy.align`` -> value as ``{"policy": {"align": value}}``; refuse values of a section itself."""
+    settings: Settings = {}
     for key, value in words.items():
         *sections, last = key.split(".")
-        node = found
+        node = settings
         for part in sections:
             node = node.setdefault(part, {})
             if not isinstance(node, dict):
@@ -265,30 +251,26 @@ def nested(words: Mapping[str, Any]) -> Settings:
         if isinstance(node.get(last), dict):
             raise MemobenchError(f"found {key}={str(value)[:80]} and {key}.{next(iter(node[last]))}=; give one of them")
         node[last] = value
-    return found
+    return settings
 
 
 def merged(*layers: Mapping[str, Any]) -> Settings:
     """Return nested settings of several layers; of a setting in several of them the last one counts."""
-    found: Settings = {}
+    settings: Settings = {}
     for layer in layers:
         if not isinstance(layer, Mapping):
             raise MemobenchError(f"found {layer!r} in the place of settings; expected name=value")
         for key, value in layer.items():
-            both = isinstance(value, Mapping) and isinstance(found.get(key), Mapping)
-            found[key] = merged(found[key], value) if both else value
-    return found
+            both = isinstance(value, Mapping) and isinstance(settings.get(key), Mapping)
+            settings[key] = merged(settings[key], value) if both else value
+    return settings
 
 
 # --- values of policy=, env=, dataset= …: a registered type, a checkpoint, a repository, a folder ---
 
 
 def choice_settings(config: type, key: str, value: str) -> dict[str, str]:
-    """Return the settings for a choice such as ``policy=``, of a command with this configuration.
-
-    Raises:
-        MemobenchError: it does not exist, with near names.
-    """
+    """Return the settings for a choice such as ``policy=``; the error of an unknown one has near names."""
     if not value:
         raise MemobenchError(f"{key}= is empty; expected a name")
     if key == DATASET:
@@ -298,8 +280,8 @@ def choice_settings(config: type, key: str, value: str) -> dict[str, str]:
     if path is not None:
         return {f"policy.{PATH}": path}
     if value not in known:
-        others = shipped_policies() if key == "policy" else {}
-        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *others])}")
+        shipped = shipped_policies() if key == "policy" else {}
+        raise MemobenchError(f"there is no {key} {value!r}, {nearest(value, [*known, *shipped])}")
     return {f"{key}.{TYPE}": value}
 
 
@@ -336,11 +318,7 @@ def dataset_settings(value: str) -> dict[str, str]:
 def chosen_class(kind: Any, name: str, section: Mapping[str, Any]) -> type | None:
     """Return the class that the settings of a choice name, by ``path`` or ``type``; None without one.
 
-    Args:
-        kind: base class of the choice. name: of the choice, for messages.
-
-    Raises:
-        MemobenchError: there is none of this name.
+    ``kind`` is the base class, ``name`` that of the choice in messages. An unregistered type is refused.
     """
     known = registered(kind)
     chosen = section.get(TYPE)
@@ -397,11 +375,7 @@ def recipes() -> dict[str, Path]:
 
 
 def recipe_file(value: str) -> Path:
-    """Return the file of a recipe: a shipped recipe by its name, or a YAML or JSON file; ``./name`` is a file.
-
-    Raises:
-        MemobenchError: it does not exist.
-    """
+    """Return the existing file of a recipe: a shipped one by its name, else YAML or JSON; ``./name`` is a file."""
     known = recipes()
     path = Path(value).expanduser()
     if value in known:
@@ -422,47 +396,43 @@ def resolve_recipe(words: Mapping[str, str]) -> dict[str, str]:
     return {CONFIG_FILE: str(recipe_file(words[RECIPE])), **without(words, RECIPE)}
 
 
-def read_config_file(given: str | None) -> Settings:
-    """Return the content of the local file that ``config_path`` names, {} without one.
-
-    Raises:
-        MemobenchError: it cannot be read as settings.
-    """
-    if given is None:
+def read_config_file(config_path: str | None) -> Settings:
+    """Return the content of the local file ``config_path``, {} without one; refuse other content than settings."""
+    if config_path is None:
         return {}
-    path = Path(given).expanduser()
+    path = Path(config_path).expanduser()
     if path.is_dir():
         path = path / TRAIN_CONFIG
     if not path.is_file():
-        if looks_local(given) or path.suffix in (".yaml", ".yml", ".json"):
-            raise MemobenchError(f"{CONFIG_FILE}={given}: there is no such file")
+        if looks_local(config_path) or path.suffix in (".yaml", ".yml", ".json"):
+            raise MemobenchError(f"{CONFIG_FILE}={config_path}: there is no such file")
         return {}  # a repository: LeRobot fetches it
     try:
         content = yaml.safe_load(path.read_bytes())
     except OSError as error:
-        raise MemobenchError(f"{CONFIG_FILE}={given} cannot be read ({error.strerror or error})") from None
+        raise MemobenchError(f"{CONFIG_FILE}={config_path} cannot be read ({error.strerror or error})") from None
     except (yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError, AttributeError) as error:
         # PyYAML also raises errors of dates, numbers and keys.
         problem = " ".join(str(error).split())
-        raise MemobenchError(f"{CONFIG_FILE}={given} is neither YAML nor JSON: {problem}") from None
+        raise MemobenchError(f"{CONFIG_FILE}={config_path} is neither YAML nor JSON: {problem}") from None
     if not isinstance(content, dict):
-        raise MemobenchError(f"{CONFIG_FILE}={given} holds no settings; expected a mapping such as 'policy: …'")
+        raise MemobenchError(f"{CONFIG_FILE}={config_path} holds no settings; expected a mapping such as 'policy: …'")
     return content
 
 
-def _begun_training(config: Any, given: str | None) -> Any:
+def _begun_training(config: Any, config_path: str | None) -> Any:
     """Return the configuration of the training whose checkpoint a ``config_path`` names, None where it names none.
 
     LeRobot finds it in a folder or a repository, and converts settings of its earlier versions.
     """
-    if given is None or not hasattr(config, "from_pretrained"):
+    if config_path is None or not hasattr(config, "from_pretrained"):
         return None
-    path = Path(given).expanduser()
+    path = Path(config_path).expanduser()
     if path.is_file() and path.name != TRAIN_CONFIG:
         return None
-    read_config_file(given)  # its errors name the file
+    read_config_file(config_path)  # its errors name the file
     with quiet():
-        return config.from_pretrained(path if path.exists() else given)
+        return config.from_pretrained(path if path.exists() else config_path)
 
 
 # --- values of the fields of a configuration class ---
@@ -472,16 +442,12 @@ NULLS = ("null", "~")
 """Texts that stand for no value, as in YAML; for a number or a truth value also ``none``."""
 
 
-def build_config(annotation: Any, given: Any, key: str = "") -> Any:
+def build_config(annotation: Any, settings: Any, key: str = "") -> Any:
     """Return the configuration of a class with these settings, or the value of a field.
 
-    Args:
-        key: name of the field or section, for messages; "" for the configuration of a command.
-
-    Raises:
-        MemobenchError: as of `value_of`, or the configuration's own.
+    ``key`` names field or section in messages, "" a command. Errors are those of `value_of` and the configuration's.
     """
-    value = value_of(key, annotation, given)
+    value = value_of(key, annotation, settings)
     try:
         with quiet():
             return draccus.decode(annotation, value)
@@ -491,24 +457,22 @@ def build_config(annotation: Any, given: Any, key: str = "") -> Any:
 
 def _explained(error: Exception, key: str) -> MemobenchError:
     """Return the innermost reason of draccus's chain of errors; the configurations' own errors stay as they are."""
-    reasons = [each for each in chain(error) if not isinstance(each, DecodingError | ParsingError)]
-    own = next((each for each in reasons if isinstance(each, MemobenchError)), None)
+    reasons = [reason for reason in chain(error) if not isinstance(reason, DecodingError | ParsingError)]
+    own = next((reason for reason in reasons if isinstance(reason, MemobenchError)), None)
     if own is not None:
         return own
-    for each in reversed([*chain(error)]):
-        if isinstance(each, DecodingError):
-            name = ".".join(part for part in (key, *each.key_path) if part)
-            return MemobenchError(f"{name}: {' '.join(str(each.message).split())}".removeprefix(": "))
+    for reason in reversed([*chain(error)]):
+        if isinstance(reason, DecodingError):
+            name = ".".join(part for part in (key, *reason.key_path) if part)
+            return MemobenchError(f"{name}: {' '.join(str(reason.message).split())}".removeprefix(": "))
     return MemobenchError(" ".join(str(reasons[-1] if reasons else error).split()))
 
 
 def typed(kind: Any, settings: Mapping[str, Any], before: str = "") -> Settings:
     """Return nested settings with values of the types of a class's fields instead of texts.
 
-    A choice's ``path`` is replaced by the settings of that checkpoint, which the given ones override.
-
-    Raises:
-        MemobenchError: there is no setting of a name, with the nearest one; or it cannot have a value.
+    A choice's ``path`` is replaced by the settings of that checkpoint, which the given ones override. An unknown name
+    (the error has the nearest one) and an impossible value are refused.
     """
     beneath: Settings = {}
     if is_choice_type(kind):
@@ -525,22 +489,18 @@ def typed(kind: Any, settings: Mapping[str, Any], before: str = "") -> Settings:
 
 def given_values(kind: Any, settings: Mapping[str, Any], before: str) -> Settings:
     """Return the values of settings of a class's fields, without ``path`` and ``type``. Errors as of `typed`."""
-    known, found = field_types(kind), {}
+    known, values = field_types(kind), {}
     for name, value in settings.items():
         if name in known:
-            found[name] = value_of(before + name, known[name], value)
+            values[name] = value_of(before + name, known[name], value)
         elif name not in (PATH, TYPE):
             keys = [f"{before}{key}" for key in known]
             raise MemobenchError(f"there is no setting {before + name!r}, {nearest(before + name, keys)}")
-    return found
+    return values
 
 
 def value_of(key: str, annotation: Any, value: Any) -> Any:
-    """Return a value of a field's type for a text; the values of files stay as they are.
-
-    Raises:
-        MemobenchError: the field cannot have this value.
-    """
+    """Return a value of a field's type for a text, or refuse it; the values of files stay as they are."""
     kind = without_none(annotation)
     is_section = dataclasses.is_dataclass(kind) or is_choice_type(kind)
     if is_section and value in NULLS:
@@ -548,7 +508,7 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
     if isinstance(value, Mapping):
         if is_section:
             return typed(kind, value, f"{key}." if key else "")
-        if typing.get_origin(kind) is dict and any(isinstance(each, Mapping) for each in value.values()):
+        if typing.get_origin(kind) is dict and any(isinstance(item, Mapping) for item in value.values()):
             return _checked_mapping(key, kind, value)
         if kind in (*PLAIN, str, Path) or is_literal(kind) or is_enum(kind):
             raise MemobenchError(f"there is no setting {f'{key}.{next(iter(value), "")}'!r}; {key} holds one value")
@@ -576,15 +536,15 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
     if kind in (str, Path):
         return value
     try:
-        found = yaml.safe_load(value)
+        content = yaml.safe_load(value)
     except yaml.YAMLError as error:
         problem = " ".join(str(error).split())
-        found = value
+        content = value
         if value[:1] in "[{" and typing.get_origin(kind) is not dict:
             raise MemobenchError(f"{key}={value[:80]} cannot be read ({problem})") from None
-    if typing.get_origin(kind) is dict and not isinstance(found, dict):
+    if typing.get_origin(kind) is dict and not isinstance(content, dict):
         raise MemobenchError(f'{key}={value[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
-    return value if isinstance(found, str) else found
+    return value if isinstance(content, str) else content
 
 
 def _checked_mapping(key: str, kind: Any, value: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -599,19 +559,19 @@ def _checked_mapping(key: str, kind: Any, value: Mapping[str, Any]) -> Mapping[s
 def _listed(key: str, kind: Any, value: str) -> str:
     """Return the value of a literal or an enumeration."""
     if is_literal(kind):
-        known = named = [str(each) for each in typing.get_args(kind)]
+        known = names = [str(choice) for choice in typing.get_args(kind)]
     else:
-        named = list(kind.__members__)
-        known = [*(str(member.value) for member in kind), *named]
+        names = list(kind.__members__)
+        known = [*(str(member.value) for member in kind), *names]
     if value not in known:
-        raise MemobenchError(f"{key}={value}: {nearest(value, named)}")
+        raise MemobenchError(f"{key}={value}: {nearest(value, names)}")
     return value
 
 
 def field_types(kind: Any) -> dict[str, Any]:
     """Return field name -> annotation of a configuration class."""
     hints = typing.get_type_hints(kind)
-    return {each.name: hints[each.name] for each in dataclasses.fields(kind)}
+    return {item.name: hints[item.name] for item in dataclasses.fields(kind)}
 
 
 def without_none(annotation: Any) -> Any:
@@ -634,15 +594,11 @@ def registries(config: type) -> dict[str, dict[str, type]]:
 # --- the policy ---
 
 
-def policy_config(asked: CommandSettings) -> PreTrainedConfig | None:
-    """Return the configuration of the policy, None without one.
-
-    Raises:
-        MemobenchError: the checkpoint is not complete, or as of `build_config`.
-    """
-    if (path := asked.get(f"policy.{PATH}")) is not None:
+def policy_config(requested: CommandSettings) -> PreTrainedConfig | None:
+    """Return the configuration of the policy, None without one; refuse an incomplete checkpoint."""
+    if (path := requested.get(f"policy.{PATH}")) is not None:
         check_checkpoint(path)
-    found: PreTrainedConfig | None = asked.build_field("policy")
-    if found is not None:
-        check_sizes(found)
-    return found
+    config: PreTrainedConfig | None = requested.build_field("policy")
+    if config is not None:
+        check_sizes(config)
+    return config

@@ -75,13 +75,13 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.sim.convention import MIRRORED
 
-    name = Path(sys.argv[0]).name.replace("_", "-")
-    command = next((one for one in ("train", "eval") if name.startswith(f"{PREFIX}{one}")), None)
+    name = Path(sys.argv[0]).name.replace("_", "-")  # `lerobot-eval`, or `lerobot_eval.py` of `python -m`
+    command = next((choice for choice in ("train", "eval") if name.startswith(f"{PREFIX}{choice}")), None)
     if command is None:
         return None, UNKNOWN_POLICY
-    asked = read_words(command, parse_words(sys.argv[1:]))
-    policy: PreTrainedConfig | None = asked.build_field("policy")
-    path = asked.get(f"policy.{PATH}")
+    requested = read_words(command, parse_words(sys.argv[1:]))
+    policy: PreTrainedConfig | None = requested.build_field("policy")
+    path = requested.get(f"policy.{PATH}")
     if command == "train" or policy is None:
         return policy, UNKNOWN_POLICY
     check_obs_type(policy, environment.obs_type, environment.suite)
@@ -93,10 +93,10 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
             "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
             f"run `lerobot eval env=memobench policy={path}`"
         )
-    named = asked.get("env.convention") or (MIRRORED if environment.camera_name_mapping else None)
-    renamed = asked.build_field("rename_map") or {}
-    found = chosen_convention(path, policy, named, renamed)
-    if found not in (None, environment.convention):  # with the names of its pictures
+    stated = requested.get("env.convention") or (MIRRORED if environment.camera_name_mapping else None)
+    renamed = requested.build_field("rename_map") or {}
+    convention = chosen_convention(path, policy, stated, renamed)
+    if convention not in (None, environment.convention):  # with the names of its pictures
         names = {"features": policy_features(), "features_map": policy_names()}
-        vars(environment).update(vars(replace(environment, **names, convention=found)))
+        vars(environment).update(vars(replace(environment, **names, convention=convention)))
     return policy, acting(policy, path, environment.settings)

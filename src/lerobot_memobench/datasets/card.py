@@ -79,19 +79,19 @@ def write_card(
     """Write ``folder``/README.md: introduction, making, statistics, columns, limitations, licence."""
     described = described_of(folder, episodes)
     requested = len(described) + len(failed)
-    made = [
+    paragraphs = [
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
         "states, actions and labels; `states/` holds the simulator's states (1 + nq + nv numbers per frame)."
     ]
     if failed:
-        seeds = (f"- {each.info['task_name']}, seed {each.info['seed']}: {each.failure}" for each in failed)
+        seeds = (f"- {episode.info['task_name']}, seed {episode.info['seed']}: {episode.failure}" for episode in failed)
         heading = f"**{len(failed)} of {requested} requested seeds have no demonstration:**"
-        made.append(heading + "\n\n" + "\n".join(seeds))
+        paragraphs.append(heading + "\n\n" + "\n".join(seeds))
     else:
-        made.append(f"All {requested} requested seeds were solved.")
+        paragraphs.append(f"All {requested} requested seeds were solved.")
     if left_out:
-        made.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {note}" for note in left_out))
-    text = _card(folder, described, failed, features, made, f'"{repo_id}", root="<this folder>"')
+        paragraphs.append(f"**Left out ({len(left_out)}):**\n\n" + "\n".join(f"- {note}" for note in left_out))
+    text = _card(folder, described, failed, features, paragraphs, f'"{repo_id}", root="<this folder>"')
     (folder / CARD_FILE).write_text(text, encoding="utf-8")
 
 
@@ -133,10 +133,10 @@ def _card(
     episodes: Sequence[Described],
     failed: Sequence[StagedEpisode],
     features: Mapping[str, dict[str, Any]],
-    made: Sequence[str],
+    paragraphs: Sequence[str],
     location: str,
 ) -> str:
-    """Return the card; ``made`` are paragraphs on its making, ``location`` the arguments of ``LeRobotDataset``."""
+    """Return the card; ``paragraphs`` are on the making, ``location`` the arguments of ``LeRobotDataset``."""
     records = [record for record, _ in episodes]
     fields = ("task_name", "memory_type", "operations", "exec_start_index")
     table = pd.DataFrame([record.model_dump(include={*fields}) | {"frames": length} for record, length in episodes])
@@ -163,7 +163,7 @@ def _card(
         types=types,
         stand_ins=sorted({name for record in records for name in record.stand_ins}),
         location=location,
-        made=made,
+        made=paragraphs,
         lengths=_lengths_table(table, types),
         bytes_per_frame=f"{size / table.frames.sum():,.0f}",
         prompts=[f"{prompts[name]:.1f} in {name} tasks" for name in types if prompts[name]],
@@ -258,12 +258,8 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[Path]:
     """Write the card's tables and the hash of each episode of the dataset in ``folder`` to ``out``; return the files.
 
-    Episodes of other programs are left out. ``notify`` is called with messages about them, and about parts that other
-    tools have removed from the dataset.
-
-    Raises:
-        MemobenchError: the folder is no dataset, one of its files is truncated (see `check_whole`), or none of its
-            episodes is one of this benchmark.
+    Episodes of other programs are left out; a dataset without others is refused, and a damaged one (`check_whole`).
+    ``notify`` is called with messages about left-out episodes, and about parts that other tools have removed.
     """
     with undamaged(folder):
         episodes = list_episodes(folder)
@@ -297,7 +293,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
 def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:
     versions = sorted({json.dumps(record.versions, sort_keys=True) for record, _ in episodes if record.versions})
     return {
-        "versions": [json.loads(each) for each in versions],
+        "versions": [json.loads(text) for text in versions],
         "episodes": [{**record.model_dump(), "failure": None} for record, _ in episodes],
     }
 

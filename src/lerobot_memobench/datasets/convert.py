@@ -188,7 +188,7 @@ def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[Con
     files, refused = [], []
     if source.is_file() and source.suffix.lower() == ".zip":
         for info in _entries(source):
-            try:
+            try:  # a part such as `..` would lead to another folder
                 name = "/".join(file_name(part, "a part of its name") for part in info.filename.split("/"))
             except MemobenchError as error:
                 printable = "".join(letter if letter.isprintable() else "?" for letter in info.filename)[:200]
@@ -264,8 +264,8 @@ def inspect(file: SourceFile) -> Findings:
         findings.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
 
     def note(reason: str) -> None:
-        one = ConversionNote(file=file.name, group="", reason=reason)
-        findings.notes += [one] * (one not in findings.notes)
+        entry = ConversionNote(file=file.name, group="", reason=reason)
+        findings.notes += [entry] * (entry not in findings.notes)
 
     try:
         with PublishedFile(file.path) as opened, unusable_on_error():

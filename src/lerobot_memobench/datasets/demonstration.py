@@ -223,15 +223,15 @@ def persistent_rows(columns: Labels) -> list[LanguageRow]:
 
 
 def _changes(texts: list[str]) -> list[tuple[int, str]]:
-    kept: list[tuple[int, str]] = []
+    changes: list[tuple[int, str]] = []
     for frame, text in enumerate(texts):
         if not text or (frame > 0 and text == texts[frame - 1]):
             continue
-        if kept and frame - kept[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
-            replaced, _ = kept.pop()
+        if changes and frame - changes[-1][0] < MIN_FRAMES_BETWEEN_ROWS:
+            replaced, _ = changes.pop()
             frame = 0 if replaced == 0 else frame  # a text must be active from the first frame on
-        kept.append((frame, text))
-    return kept
+        changes.append((frame, text))
+    return changes
 
 
 def _row(style: str, text: str, frame: int) -> LanguageRow:
@@ -271,7 +271,7 @@ def digest(demo: Demonstration) -> str:
     columns: Labels = {"states": demo.states, "actions": demo.actions, "key_frames": key_frames(demo)}
     if demo.executed is not None:
         columns["executed"] = demo.executed
-    if demo.held is not None and demo.held.any():
+    if demo.held is not None and demo.held.any():  # the column changes no hash of an episode without holds
         columns["held"] = demo.held
     columns |= {name: frame_labels[column] for name, column in HASHED.items()}
     columns["phase"] = frame_labels[OBS_PHASE].astype(np.int64)

@@ -461,10 +461,8 @@ def check_whole(folder: Path) -> None:
     """Check that a dataset has all of its frames, at the places that its metadata names, without decoding videos.
 
     The check covers ends and row counts of tables, totals, numbers of tasks, bounds and files of episodes, the
-    numbering of frames, and boxes and frame counts of videos.
-
-    Raises:
-        MemobenchError: naming the first truncated or missing file, or the first number that differs.
+    numbering of frames, and boxes and frame counts of videos. The error names the first truncated or missing file, or
+    the first number that differs.
     """
     with undamaged(folder):
         _check_bounds(folder, read_info(folder))
@@ -493,7 +491,7 @@ def _check_bounds(folder: Path, info: dict[str, Any]) -> None:
     for key, wanted in (numbers | {"path": _paths(info["data_path"], rows, "data")[of_frame]}).items():
         expect("data", key, frames[key], wanted)
     texts = [{tasks.index[k] for k in set(part)} for part in np.split(frames["task_index"].to_numpy(), ends[:-1])]
-    expect(EPISODES, "tasks", [set(each) for each in rows["tasks"]], texts)
+    expect(EPISODES, "tasks", [set(names) for names in rows["tasks"]], texts)
     for camera in (key for key, feature in info["features"].items() if feature["dtype"] == "video"):
         times = rows[[f"videos/{camera}/from_timestamp", f"videos/{camera}/to_timestamp"]].to_numpy() * info["fps"]
         expect(EPISODES, f"length of {camera}", np.diff(times)[:, 0], rows["length"])

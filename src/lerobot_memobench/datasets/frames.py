@@ -57,11 +57,7 @@ class FrameTable:
 
 
 def read_frame_table(root: Path) -> FrameTable:
-    """Read phase, holds and subgoals of every frame.
-
-    Raises:
-        MemobenchError: the frames are not numbered 0, 1, 2, ... or an episode is not contiguous.
-    """
+    """Read phase, holds and subgoals of every frame; refuse frames not numbered 0, 1, 2, ... episode by episode."""
     wanted = {*_PLACE, OBS_PHASE, HELD_COLUMN, MEMORY_COLUMN, *LEVEL_COLUMNS.values()}
     table = read_table(root / "data", wanted.__contains__).sort_by("index")
     names = {*table.column_names}
@@ -74,6 +70,7 @@ def read_frame_table(root: Path) -> FrameTable:
         )
     return FrameTable(
         episodes=np.append(starts, len(table)).astype(np.int64),
+        # Without these columns every frame is one of the execution.
         phase=number.get(OBS_PHASE, np.ones(len(table))).astype(np.uint8),
         held=number.get(HELD_COLUMN, np.zeros(len(table))).astype(np.bool_),
         subgoals={level: texts(table.column(name)) for level, name in LEVEL_COLUMNS.items() if name in names},
@@ -161,7 +158,7 @@ class FrameLookup:
         self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0, width)
         self.memories: list[str] = []
         self._memory_rows: np.ndarray | None = None
-        if table.memory is not None:
+        if table.memory is not None:  # as objects: NumPy's own texts would each be as wide as the longest
             memories, self._memory_rows = np.unique(np.array(table.memory, dtype=object), return_inverse=True)
             self.memories = memories.tolist()
         self.columns: Columns = columns or {}

@@ -123,10 +123,10 @@ def generate(
         else:
             _report_size(jobs, settings, out, workers, notify)
             run_jobs(jobs, workers=workers, progress=progress)
-        made = [job.episode() for job in jobs]
-        summary = _summary([{**episode.info, "failure": episode.failure} for episode in made], tasks, out)
+        staged = [job.episode() for job in jobs]
+        summary = _summary([{**episode.info, "failure": episode.failure} for episode in staged], tasks, out)
         if summary.folder is not None:
-            assemble(made, out, repo_id=repo_id, made_by=made_by, manifest={"request": request})
+            assemble(staged, out, repo_id=repo_id, made_by=made_by, manifest={"request": request})
             shutil.rmtree(out / STAGING)
         return summary
 
@@ -189,10 +189,10 @@ def _versions() -> dict[str, str]:
 # --- size and time ---
 
 
-def run_size(frames: int, image_size: int | None, held: int = 0) -> int:
+def run_size(frames: int, image_size: int | None, held_frames: int = 0) -> int:
     """Return the approximate bytes of numbers of frames and held frames; ``image_size`` is None without images."""
     area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
-    return round(frames * FRAME_BYTES + (frames * IMAGES_BYTES + held * HELD_BYTES) * area)
+    return round(frames * FRAME_BYTES + (frames * IMAGES_BYTES + held_frames * HELD_BYTES) * area)
 
 
 def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
@@ -200,10 +200,8 @@ def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None],
 
     Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
 
-    Args:
-        size: approximate bytes of the dataset; ``staged`` of them exist already.
-        work: amount of work, which begins the message.
-        extra: bytes of temporary files.
+    ``size`` is the dataset's, approximately, ``staged`` of it exists already, ``extra`` is that of temporary files, all
+    in bytes; ``work`` begins the message.
     """
     free, most = free_bytes(out), max(2 * size - staged, 0) + extra
     sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
@@ -223,14 +221,14 @@ def _report_size(
     frames, left = (
         sum(FRAMES[job.task.suite].get(job.task.memory_type, 600) for job in some) for some in (jobs, missing)
     )
-    held, held_left = (
+    held_frames, held_left = (
         sum(HELD.get(job.task.memory_type, 0) for job in some if job.task.suite == STRICT) for some in (jobs, missing)
     )
     area = ((side or 0) / IMAGE_SIZE) ** 2
     seconds = left * FRAME_SECONDS + (left * IMAGES_SECONDS + held_left * HELD_SECONDS) * area
     minutes = seconds / 60 / max(min(workers, cores()), 1)
     time = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(round(minutes), 1)} min"
-    size = run_size(frames, side, held)
+    size = run_size(frames, side, held_frames)
     extent = f"{left:,} frames{f' and {held_left:,} held ones' if held_left else ''}"
     work = f"{len(missing)} demonstrations of about {extent}, in about {time} with {workers} at a time"
     check_room(out, size, size - run_size(left, side, held_left), notify, work)
@@ -265,5 +263,5 @@ class GenerationSummary:
 
 def _summary(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -> GenerationSummary:
     episodes = tuple(EpisodeOutcome(row["task_name"], row["seed"], row["frames"], row["failure"]) for row in rows)
-    made = any(episode.failure is None for episode in episodes)
-    return GenerationSummary(out if made else None, tuple(task.name for task in tasks), episodes)
+    succeeded = any(episode.failure is None for episode in episodes)
+    return GenerationSummary(out if succeeded else None, tuple(task.name for task in tasks), episodes)

@@ -76,8 +76,7 @@ class PublishedDemo:
 class PublishedFile:
     """A file in the published layout; a context.
 
-    Raises:
-        Unusable: naming the first difference to the layout. Raised on opening it concerns the file, by `read` a group.
+    `Unusable` names the first difference to the layout: on opening it concerns the file, by `read` a group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -174,7 +173,7 @@ class PublishedFile:
         for start in range(0, len(obs[names["image"]]), FRAMES_PER_READ):
             try:
                 block = {camera: obs[name][start : start + FRAMES_PER_READ] for camera, name in names.items()}
-            except Exception as error:
+            except Exception as error:  # h5py raises OSError, KeyError, RuntimeError or ValueError for damage
                 raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
             for offset in range(len(block["image"])):
                 frame = {camera: frames[offset] for camera, frames in block.items()}

@@ -208,7 +208,7 @@ def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
     stored = next(file.images(demo.group)).items()
     pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
     far = {
-        name: float(np.mean([np.abs(drawn - given[::rows, ::columns]) for drawn, given in pairs]))
+        name: float(np.mean([np.abs(drawn - picture[::rows, ::columns]) for drawn, picture in pairs]))
         for name, (rows, columns) in ORIENTATIONS.items()
     }
     best, second = sorted(far, key=lambda name: far[name])[:2]
@@ -253,6 +253,7 @@ def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
     for index in range(model.njnt):
         joint = model.joint(index)
         kind = JOINT_TYPES[int(joint.type[0])]
+        # A state begins with the time.
         position, velocity = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
         nq, nv = WIDTHS[kind]
         body = model.body(int(joint.bodyid[0])).name
@@ -300,9 +301,9 @@ def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> No
                 f"model_file's {tag} {name[:200]!r} has the attribute {unread!r}, which is not read; store the scene "
                 "as MuJoCo saves it"
             )
-        kept = {key: element.attrib[key] for key in ("name", *KEPT[tag]) if key in element.attrib}
-        copy = ElementTree.SubElement(target, tag, kept)
-        if tag == "body":
+        attributes = {key: element.attrib[key] for key in ("name", *KEPT[tag]) if key in element.attrib}
+        copy = ElementTree.SubElement(target, tag, attributes)
+        if tag == "body":  # MuJoCo compiles no moving body without a mass, and its geoms are left out
             ElementTree.SubElement(copy, "inertial", pos="0 0 0", mass="1", diaginertia="1 1 1")
             _copy_bodies(element, copy)
 

@@ -84,8 +84,10 @@ class StagedEpisode(BaseModel):
 
     def camera_stats(self) -> dict[str, Stats]:
         """Return the statistics of each camera's pixels by the name of its column."""
-        stats = self.image_stats.items()
-        return {image_key(camera): {name: np.array(value) for name, value in one.items()} for camera, one in stats}
+        return {
+            image_key(camera): {name: np.array(value) for name, value in stats.items()}
+            for camera, stats in self.image_stats.items()
+        }
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
@@ -263,6 +265,7 @@ def _temporary_folder(folder: Path) -> Path:
 
     Killed workers leave such folders, which are removed with the staging folder.
     """
+    # Two workers may make the same episode, so each has a name of its own.
     temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
     temporary.mkdir(parents=True)
     return temporary
@@ -302,10 +305,7 @@ def check_destination(out: Path) -> None:
 def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
     """Lock the destination ``out`` for a run with ``request``; yield the folder of its finished episodes.
 
-    Episodes of an unfinished run of the same request are kept.
-
-    Raises:
-        MemobenchError: another run is writing there, or an unfinished run has another request.
+    Episodes of an unfinished run of the same request are kept. Another request, and a run that goes on, are refused.
     """
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)

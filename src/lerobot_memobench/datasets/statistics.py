@@ -85,7 +85,7 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
 
     Quantiles must lie between the extremes only, because LeRobot's tools average the quantiles of episodes.
     """
-    features, kept = read_info(folder)["features"], recorded(folder)
+    features, recorded_stats = read_info(folder)["features"], recorded(folder)
     for name, stats in compute(folder, names).items():
         is_image = features[name]["dtype"] in IMAGES
         low, high = (np.zeros(1), np.ones(1)) if is_image else (stats["min"].ravel(), stats["max"].ravel())
@@ -93,7 +93,7 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
         for key, value in stats.items():
             bounded = key.startswith("q") or (is_image and key != "mean" and key != "std")
             least, most = (low, high) if bounded else (value.ravel(), value.ravel())
-            stored = kept.get(name, {}).get(key)
+            stored = recorded_stats.get(name, {}).get(key)
             if not (is_image and key == "count") and not _within(stored, value.size, least - slack, most + slack):
                 raise MemobenchError(
                     f"{key} of {name} is {short(stored)}, expected {short(value.tolist())} of the frames; {ADVICE}"
@@ -136,8 +136,8 @@ def lacking(folder: Path, needed: Mapping[str, Collection[str]]) -> list[str]:
 def complete(folder: Path, names: Sequence[str], notify: Callable[[str], None]) -> None:
     """Compute the statistics of features that lack some, and add those to a dataset's ``meta/stats.json``."""
     notify(f"computing and adding statistics that {folder / STATS_FILE} lacks: {', '.join(names)}")
-    kept = recorded(folder)
+    recorded_stats = recorded(folder)
     for name, stats in compute(folder, names).items():
-        kept[name] = {key: value.tolist() for key, value in stats.items()} | kept.get(name, {})
+        recorded_stats[name] = {key: value.tolist() for key, value in stats.items()} | recorded_stats.get(name, {})
     with explaining_disk_errors(folder):
-        write_file(folder / STATS_FILE, json.dumps(kept, indent=4))
+        write_file(folder / STATS_FILE, json.dumps(recorded_stats, indent=4))

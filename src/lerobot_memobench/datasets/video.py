@@ -192,11 +192,7 @@ FrameReader = Callable[[int, list[int]], Any]
 
 
 def frame_reader(root: Path, camera: str) -> FrameReader:
-    """Return the reader of a camera of the dataset in ``root``; it decodes the frames of a call in one sweep.
-
-    Raises:
-        MemobenchError: the dataset has no such camera or no images, or its metadata is damaged.
-    """
+    """Return the reader of a camera of the dataset in ``root``; it decodes the frames of a call in one sweep."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     with naming_damage(root):

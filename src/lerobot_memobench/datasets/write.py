@@ -190,7 +190,7 @@ def _write_manifest(
 def _move(build: Path, out: Path) -> None:
     """Move the finished build into ``out``, which becomes a dataset with the last move."""
     out.mkdir(parents=True, exist_ok=True)
-    flush_to_disk(files_below(build))
+    flush_to_disk(files_below(build))  # `meta` must not arrive before the files that it names
     for name in TOP_LEVEL:
         target = out / name
         if target.is_dir():

@@ -134,7 +134,7 @@ class FeaturePyramid(nn.Module):
     def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
         """Return (N, (GRID FINER)², width), row by row."""
         x = tokens.unflatten(1, (GRID, GRID))
-        for level, lateral in zip(self.levels, reversed(maps), strict=False):
+        for level, lateral in zip(self.levels, reversed(maps), strict=False):  # the finest maps are left over
             x = level(x, lateral)
         return x.flatten(1, 2)
 
@@ -257,18 +257,19 @@ def detections(output: DetectorOutput) -> list[Detections]:
         return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / output.side, rest], dim=1)
 
     side = output.heatmap.shape[-1]
-    there = (image, kind, (row + 0.5) / side, (column + 0.5) / side)
-    geometry = _interpolated(in_image, output.side, *there)
-    found = np.zeros(len(image), DETECTION)
-    found["kind"], found["score"] = kind.numpy(), scores[which, rank].detach().numpy()
-    found["place"], found["turn"] = geometry[:, :2], geometry[:, -2:]
+    positions = (image, kind, (row + 0.5) / side, (column + 0.5) / side)
+    geometry = _interpolated(in_image, output.side, *positions)
+    detected = np.zeros(len(image), DETECTION)
+    detected["kind"], detected["score"] = kind.numpy(), scores[which, rank].detach().numpy()
+    detected["place"], detected["turn"] = geometry[:, :2], geometry[:, -2:]
     for name in ("depth", "height", "joint"):
-        found[name] = geometry[:, GEOMETRY.index(name)]
-    found["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
+        detected[name] = geometry[:, GEOMETRY.index(name)]
+    detected["lit"] = expit(geometry[:, GEOMETRY.index("lit")])
     if output.uncertainty is not None:
-        found["uncertainty"] = np.exp(_interpolated(output.uncertainty, output.side, *there)) / [output.side, 1, 1]
+        uncertainty = np.exp(_interpolated(output.uncertainty, output.side, *positions))
+        detected["uncertainty"] = uncertainty / [output.side, 1, 1]
     owner = image.numpy()
-    return [found[owner == number] for number in range(len(scores))]
+    return [detected[owner == number] for number in range(len(scores))]
 
 
 def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
@@ -277,11 +278,11 @@ def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor,
     A cell is image, kind, row and column, (N, MAX_DETECTIONS) each.
     """
     heat, side = torch.sigmoid(output.heatmap), output.heatmap.shape[-1]
-    scores, places = (
+    scores, indices = (
         torch.where(heat == max_pool2d(heat, 3, 1, 1), heat, torch.zeros(())).flatten(1).topk(MAX_DETECTIONS, dim=1)
     )
-    images = torch.arange(len(heat))[:, None].expand_as(places)
-    cells = (images, places // side**2, places // side % side, places % side)
+    images = torch.arange(len(heat))[:, None].expand_as(indices)
+    cells = (images, indices // side**2, indices // side % side, indices % side)
     if output.score is not None:
         logits = output.score(*(cell.flatten() for cell in cells)).view(*scores.shape, -1)
         refined = torch.sigmoid(logits.gather(2, cells[1][..., None])[..., 0])

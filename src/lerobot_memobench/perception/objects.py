@@ -89,6 +89,7 @@ def projected(positions: Array, view: View) -> tuple[Array, Array]:
     """
     local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
     depth = -local[..., 2]
+    # Points in the camera's plane have no place; the bound keeps theirs finite.
     reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
     return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
 
@@ -129,8 +130,8 @@ class DetectedObject:
     joint: float
     lit: float
 
-    def merge(self, other: DetectedObject, one: bool) -> None:
-        """Merge the detection of another camera with a lower score; ``one``: a scene has one object of this kind.
+    def merge(self, other: DetectedObject, unique: bool) -> None:
+        """Merge the detection of another camera with a lower score; ``unique``: a scene has one object of this kind.
 
         Positions are averaged by their precisions, along each line of sight and across. The rotation is that of the
         higher score, except the wrist camera's from a large distance. The origins of fixtures and their parts are
@@ -141,8 +142,8 @@ class DetectedObject:
         self.lit = max(self.lit, other.lit)
         both = self.precision + other.precision
         mean = np.linalg.solve(both, self.precision @ self.position + other.precision @ other.position)
-        self.position, self.precision = (outside.position, outside.precision) if one else (np.asarray(mean), both)
-        if self.cameras[0] == "wrist" and (one or self.depth > WRIST_RANGE):
+        self.position, self.precision = (outside.position, outside.precision) if unique else (np.asarray(mean), both)
+        if self.cameras[0] == "wrist" and (unique or self.depth > WRIST_RANGE):
             self.depth, self.axis, self.joint = other.depth, other.axis, other.joint
 
 
@@ -152,7 +153,7 @@ class ObjectLocalizer:
     def __init__(self, detector: Detector) -> None:
         self.detector = detector
         names = ["drawer" if kind in DRAWERS else kind for kind in detector.kinds]
-        self._one = [kind in ONE for kind in detector.kinds]
+        self._unique = [kind in ONE for kind in detector.kinds]
         self._class = [classes().index(name) if name in classes() else None for name in names]
 
     @torch.inference_mode()
@@ -164,42 +165,42 @@ class ObjectLocalizer:
             states: (N, >= 6) the hand's position, m, and its rotation as axis times angle, rad.
         """
         both = torch.cat([area_averaged(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
-        found = detections(self.detector(both))
+        detected = detections(self.detector(both))
         hands = states.cpu().numpy().astype(np.float64)
         slots = []
         for row in range(len(hands)):
-            by_camera = dict(zip(MJCF_CAMERAS, found[row :: len(hands)], strict=True))
+            by_camera = dict(zip(MJCF_CAMERAS, detected[row :: len(hands)], strict=True))
             slots.append(self.slots(by_camera, views_of(hands[row])))
         return torch.stack(slots)
 
-    def slots(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> Tensor:
+    def slots(self, detected: Mapping[str, Detections], views: Mapping[str, View]) -> Tensor:
         """Return the slots (SIZE,) of each camera's detections at one time."""
-        rows, places = [], []
-        for one in sorted(self.objects(found, views)[:SLOTS], key=lambda one: one.kind):
-            kind = self.detector.kinds[one.kind]
-            joint = one.joint if kind in PARTS else 0.0
-            places.append(one.position * (kind not in DRAWERS))  # those are in the order of their kinds, from the top
-            lit = float(one.lit > LIT)
-            rows.append([1.0, self._class[one.kind], *one.position, *one.axis, 0.0, 0.0, 0.0, joint, lit])
-        slots = torch.from_numpy(fill_slots(np.array(rows).reshape(-1, WIDTH), np.array(places).reshape(-1, 3)))
+        rows, positions = [], []
+        for obj in sorted(self.objects(detected, views)[:SLOTS], key=lambda obj: obj.kind):
+            kind = self.detector.kinds[obj.kind]
+            joint = obj.joint if kind in PARTS else 0.0
+            positions.append(obj.position * (kind not in DRAWERS))  # drawers are in the order of kinds, from the top
+            lit = float(obj.lit > LIT)
+            rows.append([1.0, self._class[obj.kind], *obj.position, *obj.axis, 0.0, 0.0, 0.0, joint, lit])
+        slots = torch.from_numpy(fill_slots(np.array(rows).reshape(-1, WIDTH), np.array(positions).reshape(-1, 3)))
         return upright(slots.unflatten(0, (SLOTS, WIDTH))).flatten()
 
-    def objects(self, found: Mapping[str, Detections], views: Mapping[str, View]) -> list[DetectedObject]:
+    def objects(self, detected: Mapping[str, Detections], views: Mapping[str, View]) -> list[DetectedObject]:
         """Return the objects by each camera's detections at one time, highest score first."""
-        single = [self._located(camera, views[camera], one) for camera in found for one in found[camera]]
+        single = [self._located(camera, views[camera], row) for camera in detected for row in detected[camera]]
         objects: list[DetectedObject] = []
-        for new in sorted(single, key=lambda one: -one.score):
+        for new in sorted(single, key=lambda obj: -obj.score):
             if self._class[new.kind] is None:
                 continue
-            known = next((one for one in objects if self._same(one, new)), None)
+            known = next((obj for obj in objects if self._same(obj, new)), None)
             if known is None:
                 objects.append(new)
             elif new.cameras[0] not in known.cameras:
-                known.merge(new, self._one[new.kind])
-        return [one for one in objects if len(one.cameras) > 1 or one.score > MIN_SCORE_ALONE]
+                known.merge(new, self._unique[new.kind])
+        return [obj for obj in objects if len(obj.cameras) > 1 or obj.score > MIN_SCORE_ALONE]
 
     def _same(self, known: DetectedObject, new: DetectedObject) -> bool:
-        if known.kind != new.kind or self._one[new.kind]:
+        if known.kind != new.kind or self._unique[new.kind]:
             return known.kind == new.kind
         apart = APART if new.cameras[0] in known.cameras else SAME
         return float(np.linalg.norm(known.position - new.position)) < apart

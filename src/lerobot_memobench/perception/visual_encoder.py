@@ -76,8 +76,8 @@ class VisualEncoder(nn.Module):
         super().__init__()
         self.widths, self.blocks, self.width = widths, blocks, widths[-1]
         self.stages = nn.ModuleList(
-            nn.Sequential(ConvNorm(here, there, stride=2), nn.ReLU(), *(ResidualBlock(there) for _ in range(count)))
-            for here, there, count in zip((3, *widths[:-1]), widths, blocks, strict=True)
+            nn.Sequential(ConvNorm(before, width, stride=2), nn.ReLU(), *(ResidualBlock(width) for _ in range(count)))
+            for before, width, count in zip((3, *widths[:-1]), widths, blocks, strict=True)
         )
         self.grid_position = nn.Parameter(torch.zeros(widths[-1], GRID, GRID))
         self.decorrelate: nn.Module = nn.Identity()

@@ -38,7 +38,7 @@ class WeightAverage:
     def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
         self.decay, self.parameters = decay, dict(parameters)
         self.counts = dict.fromkeys(self.parameters, 0)
-        self.average = {name: one.detach().to(torch.float32, copy=True) for name, one in self.parameters.items()}
+        self.average = {name: weight.detach().to(torch.float32, copy=True) for name, weight in self.parameters.items()}
 
     @torch.no_grad()
     def update(self) -> None:
@@ -52,11 +52,7 @@ class WeightAverage:
 
     @contextmanager
     def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
-        """Set the module's parameters to the average inside the block; float32 parameters are not copied.
-
-        Args:
-            dtypes: parameters whose precision changes too.
-        """
+        """Set the parameters to the average inside the block, some in other ``dtypes``; float32 ones are not copied."""
         trained = {name: parameter.data for name, parameter in self.parameters.items()}
         try:
             for name, parameter in self.parameters.items():
@@ -73,25 +69,22 @@ class WeightAverage:
             if parameter.dtype != torch.float32:
                 tensors[f"average.{name}"] = self.average[name]
         longest = max(self.counts.values(), default=0)
-        others = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
+        other_counts = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
         folder.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **others})
+        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **other_counts})
 
     @torch.no_grad()
     def restore(self, path: Path, names: Collection[str]) -> list[str]:
         """Restore weights, averages and numbers of updates of these parameters in a module that holds the average.
 
-        Returns:
-            Names of parameters without a saved state; their average starts at their present weights.
-
-        Raises:
-            MemobenchError: the file cannot be read, or does not fit.
+        Return the parameters without a saved state, whose average starts at their present weights. A file that cannot
+        be read, or does not fit, is refused.
         """
         with undamaged_tensors(path), safe_open(path, framework="pt") as file:
             metadata = file.metadata()
         tensors: Mapping[str, Tensor] = read_tensors(path)
-        found = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
-        for name, weights in found.items():
+        saved = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
+        for name, weights in saved.items():
             parameter = self.parameters[name]
             if weights.shape != parameter.shape:
                 raise MemobenchError(
@@ -101,7 +94,7 @@ class WeightAverage:
             self.average[name] = average.to(parameter.device, torch.float32, copy=True)
             self.counts[name] = int(metadata.get(f"updates.{name}", metadata["updates"]))
             parameter.copy_(weights.to(parameter.device))
-        return [name for name in self.parameters if name not in found]
+        return [name for name in self.parameters if name not in saved]
 
 
 def begin_average(policy: Any) -> WeightAverage | None:
@@ -109,9 +102,6 @@ def begin_average(policy: Any) -> WeightAverage | None:
 
     A policy loaded from a checkpoint holds the average. Its trained weights are restored, and the average continues;
     for parts that are initialised again, or that the checkpoint did not train, it starts at their weights.
-
-    Raises:
-        MemobenchError: the checkpoint's trained weights cannot be read, or do not fit.
     """
     config = policy.config
     if not config.ema_decay or config.use_peft:

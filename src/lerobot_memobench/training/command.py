@@ -87,10 +87,10 @@ NOT_COMPARED = {
 def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int:
     """Run ``lerobot train`` by the words of `commands.command_line.parse_words`; return the exit status."""
     prompt_frames, obs_type, rest = take_training_options(resolve_recipe(with_last_checkpoint(words)))
-    asked = read_words("train", rest)
+    requested = read_words("train", rest)
     if HELP in words:
-        return call_lerobot("train", ["--help", *(f"--{word}" for word in as_command_line(asked.words))])
-    config = complete_training(asked, notify)
+        return call_lerobot("train", ["--help", *(f"--{word}" for word in as_command_line(requested.words))])
+    config = complete_training(requested, notify)
     if config.checkpoint_path is not None:
         done = step_reached(config.checkpoint_path)
         if done >= config.steps:
@@ -101,7 +101,7 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
     root = config.dataset.root
     with (
         adding_resume_hint("lerobot", lambda: resume_hint(config, words)),
-        locked_run(asked.get("output_dir")),
+        locked_run(requested.get("output_dir")),
         naming_damage(Path(root) if root else None),
     ):
         if config.policy is not None and config.policy.type == MEMORY_POLICY:
@@ -161,36 +161,36 @@ def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | 
 # -- configuration -----------------------------------------------------------------------------------------------------
 
 
-def complete_training(asked: CommandSettings, notify: Callable[[str], None] = print) -> TrainPipelineConfig:
+def complete_training(requested: CommandSettings, notify: Callable[[str], None] = print) -> TrainPipelineConfig:
     """Return the configuration of a training with the benchmark's defaults, checked and completed by LeRobot.
 
     Raises:
         MemobenchError: no policy is named, settings do not go together, the dataset or the checkpoint cannot be used,
             or a resumed training has other settings.
     """
-    if not (asked.get("policy") or asked.get("reward_model")):
+    if not (requested.get("policy") or requested.get("reward_model")):
         raise MemobenchError("name a policy: policy=memobench_mem")
-    asked = asked.default("dataset.repo_id", DEFAULT_REPO_ID)
-    if asked.get("policy") and asked.get("policy.repo_id") is None:  # LeRobot would require one
-        asked = asked.default("policy.push_to_hub", False)
-    path = asked.get(f"policy.{PATH}")
-    check_device(asked.get("policy.device"))
-    check_dataset(asked)
+    requested = requested.default("dataset.repo_id", DEFAULT_REPO_ID)
+    if requested.get("policy") and requested.get("policy.repo_id") is None:  # LeRobot would require one
+        requested = requested.default("policy.push_to_hub", False)
+    path = requested.get(f"policy.{PATH}")
+    check_device(requested.get("policy.device"))
+    check_dataset(requested)
     if path is not None:
         check_checkpoint(path)
-    asked, config = build_training(with_memory_defaults(asked))
+    requested, config = build_training(with_memory_defaults(requested))
     for key, smallest in SMALLEST.items():
-        if (given := attrgetter(key)(config)) < smallest:
-            raise MemobenchError(f"found {key}={given}; expected at least {smallest}")
+        if (value := attrgetter(key)(config)) < smallest:
+            raise MemobenchError(f"found {key}={value}; expected at least {smallest}")
     policy: Any = config.policy
     if getattr(policy, "type", None) == MEMORY_POLICY:
         check_settings(config)
-    check_with_lerobot(config, asked)
+    check_with_lerobot(config, requested)
     if config.checkpoint_path is not None:
-        check_same_training(asked, config, config.checkpoint_path, notify)
+        check_same_training(requested, config, config.checkpoint_path, notify)
     if policy is not None:
         check_sizes(policy)
-        check_memory_settings(asked, policy)
+        check_memory_settings(requested, policy)
     if path is not None:
         with quiet():
             trained = as_trained(path, policy)
@@ -201,58 +201,60 @@ def complete_training(asked: CommandSettings, notify: Callable[[str], None] = pr
             notify(f"note: '{path}' was trained with {was}; this training continues from its weights with {now}")
     if getattr(config.env, "type", None) == "memobench":
         check_obs_type(policy, config.env.obs_type, config.env.suite)
-    if config.steps < SHORT_TRAINING and asked.get("log_freq") is None:
+    if config.steps < SHORT_TRAINING and requested.get("log_freq") is None:
         config.log_freq = max(1, config.steps // 10)
-    if asked.get("batch_size") is None and getattr(policy, "decodes_no_video", False):
+    if requested.get("batch_size") is None and getattr(policy, "decodes_no_video", False):
         config.batch_size = OBJECT_BATCH
-    if asked.get("num_workers") is None and cores() < 4:  # LeRobot's default is four loaders
+    if requested.get("num_workers") is None and cores() < 4:  # LeRobot's default is four loaders
         config.num_workers = cores()
     return config
 
 
-def build_training(asked: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
+def build_training(requested: CommandSettings) -> tuple[CommandSettings, TrainPipelineConfig]:
     """Return settings and configuration; settings of a checkpoint that have no effect under them get their defaults."""
     try:
-        return asked, asked.build()
+        return requested, requested.build()
     except MemobenchError as error:
         unread = getattr(error, "defaults", {})
-        if not unread or asked.get(f"policy.{PATH}") is None:
+        if not unread or requested.get(f"policy.{PATH}") is None:
             raise
-        asked = replace(asked, words={**{f"policy.{name}": value for name, value in unread.items()}, **asked.words})
-        return asked, asked.build()
+        defaults = {f"policy.{name}": value for name, value in unread.items()}
+        requested = replace(requested, words={**defaults, **requested.words})
+        return requested, requested.build()
 
 
-def with_memory_defaults(asked: CommandSettings) -> CommandSettings:
+def with_memory_defaults(requested: CommandSettings) -> CommandSettings:
     """Return settings in which a memory that differs from the checkpoint's or the recipe's has its own defaults."""
-    memory, path = asked.words.get("policy.memory"), asked.get(f"policy.{PATH}")
+    memory, path = requested.words.get("policy.memory"), requested.get(f"policy.{PATH}")
     if memory is None:
-        return asked
+        return requested
     folder = None if path is None else local_folder(path)
-    begun = read_checkpoint_json(folder / POLICY_CONFIG) if folder is not None else asked.file.get("policy") or {}
+    begun = read_checkpoint_json(folder / POLICY_CONFIG) if folder is not None else requested.file.get("policy") or {}
     if begun.get("type") != MEMORY_POLICY:
-        return asked
+        return requested
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig, memory_defaults
 
     if begun.get("memory", MemobenchMemConfig.memory) == memory:
-        return asked
+        return requested
     defaults = {f"policy.{name}": value for name, value in memory_defaults().items()}
-    return replace(asked, words={**defaults, **asked.words})
+    return replace(requested, words={**defaults, **requested.words})
 
 
-def check_with_lerobot(config: TrainPipelineConfig, asked: CommandSettings) -> None:
+def check_with_lerobot(config: TrainPipelineConfig, requested: CommandSettings) -> None:
     """Let LeRobot check a configuration and complete its folder, job, optimizer and resumed checkpoint.
 
     Raises:
         MemobenchError: LeRobot refuses it, or the folder of a new training exists.
     """
     if not config.resume and config.output_dir is not None and config.output_dir.is_dir():
-        with locked_run(asked.get("output_dir")):  # a training that is running there is the better reason
+        with locked_run(requested.get("output_dir")):  # a training that is running there is the better reason
             raise MemobenchError(
                 f"the folder output_dir={config.output_dir} exists already; name another one, or resume its training "
                 "with resume=true"
             )
-    given = {CONFIG_FILE: asked.config_path, "output_dir": asked.words.get("output_dir")} if config.resume else {}
-    line, sys.argv = sys.argv, [sys.argv[0], *(f"--{key}={value}" for key, value in given.items() if value is not None)]
+    settings = {CONFIG_FILE: requested.config_path, "output_dir": requested.words.get("output_dir")}
+    flags = [f"--{key}={value}" for key, value in settings.items() if config.resume and value is not None]
+    line, sys.argv = sys.argv, [sys.argv[0], *flags]
     try:
         config.validate()  # it reads the checkpoint and the folder of a resumed training from `sys.argv`
     except (ValueError, FileNotFoundError) as error:
@@ -266,8 +268,8 @@ def check_settings(config: TrainPipelineConfig) -> None:
     policy: Any = config.policy
     unused = type(config)(config.dataset)
     for name, value in vars(config).items():
-        for setting, given in () if name in READ else changes(name, value, getattr(unused, name, None)):
-            raise MemobenchError(f"{setting}={given} has no effect on policy={policy.type}; leave it out")
+        for setting, changed in () if name in READ else changes(name, value, getattr(unused, name, None)):
+            raise MemobenchError(f"{setting}={changed} has no effect on policy={policy.type}; leave it out")
     encodes_ahead = policy.uses_detector or policy.uses_visual_encoder
     encoded = config.dataset.image_transforms.enable and encodes_ahead
     refused = [
@@ -284,15 +286,15 @@ def check_settings(config: TrainPipelineConfig) -> None:
 def changes(name: str, value: object, default: object) -> Iterator[tuple[str, object]]:
     """Yield name and value of the settings of a field that differ from its default."""
     if is_dataclass(value) and is_dataclass(default):
-        for one in fields(value):
-            yield from changes(f"{name}.{one.name}", getattr(value, one.name), getattr(default, one.name, None))
+        for item in fields(value):
+            yield from changes(f"{name}.{item.name}", getattr(value, item.name), getattr(default, item.name, None))
     elif value != default:
         yield name, value
 
 
-def check_dataset(asked: CommandSettings) -> None:
+def check_dataset(requested: CommandSettings) -> None:
     """Refuse a folder that is not a dataset; a folder that does not exist may be one to download into."""
-    root, repository = asked.get("dataset.root"), asked.get("dataset.repo_id")
+    root, repository = requested.get("dataset.root"), requested.get("dataset.repo_id")
     if root is None:
         if repository is not None and looks_local(repository):
             raise MemobenchError(
@@ -309,13 +311,13 @@ def check_dataset(asked: CommandSettings) -> None:
     check_fetched(folder)
 
 
-def check_memory_settings(asked: CommandSettings, policy: Any) -> None:
+def check_memory_settings(requested: CommandSettings, policy: Any) -> None:
     """Refuse settings on the command line that belong to another memory; a checkpoint's may."""
     from lerobot_memobench.policies.memobench_mem.memory import NONE, mechanism_settings
 
-    given = asked.words.get("policy.memory_settings")
-    if given and getattr(policy, "memory", NONE) != NONE:
-        mechanism_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], given))
+    settings = requested.words.get("policy.memory_settings")
+    if settings and getattr(policy, "memory", NONE) != NONE:
+        mechanism_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], settings))
 
 
 # -- resumed trainings -------------------------------------------------------------------------------------------------
@@ -348,11 +350,11 @@ def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
     checkpoint = last_checkpoint(Path(folder).expanduser())
     checkpoint_type(str(checkpoint))
     begun = (read_checkpoint_json(checkpoint / TRAIN_CONFIG).get("policy") or {}).get("type")
-    kind = named = words.get("policy") or words.get(f"policy.{TYPE}")
-    if named is not None and (source := checkpoint_folder(named)) is not None:
+    kind = policy = words.get("policy") or words.get(f"policy.{TYPE}")
+    if policy is not None and (source := checkpoint_folder(policy)) is not None:
         kind = checkpoint_type(str(source))
     if kind is not None and begun is not None and "/" not in kind and kind != begun:
-        raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={named}; leave policy out")
+        raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={policy}; leave policy out")
     return {
         CONFIG_FILE: str(checkpoint / TRAIN_CONFIG),
         **without(words, "policy", f"policy.{PATH}", f"policy.{TYPE}"),
@@ -388,8 +390,8 @@ def make_room_for_link(last: Path) -> None:
     """Remove a file that a copy made of the link ``last`` of a training, because LeRobot makes the link."""
     if last.is_symlink() or not last.exists():
         return
-    named = text_of_link(last)
-    if not (named and named.isdecimal()):
+    target = text_of_link(last)
+    if not (target and target.isdecimal()):
         raise MemobenchError(
             f"{last} is not a link, and LeRobot makes a link of that name with each checkpoint; rename it, for example "
             "to the number of its step"
@@ -398,28 +400,28 @@ def make_room_for_link(last: Path) -> None:
 
 
 def check_same_training(
-    asked: CommandSettings, config: TrainPipelineConfig, checkpoint: Path, notify: Callable[[str], None]
+    requested: CommandSettings, config: TrainPipelineConfig, checkpoint: Path, notify: Callable[[str], None]
 ) -> None:
     """Refuse to resume a training with another dataset, or with settings that it cannot change; note the others."""
-    begun, model = asked.begun, checkpoint / "pretrained_model"
+    begun, model = requested.begun, checkpoint / "pretrained_model"
     another = f"train a new run from the checkpoint: policy={model} output_dir=<new folder>"
     check_processors(model)
     _check_same_dataset(config.dataset, begun.dataset, another)
     changed = []
-    for name in asked.words:
+    for name in requested.words:
         try:
-            value, held = (attrgetter(name)(one) for one in (config, begun))
+            value, before = (attrgetter(name)(source) for source in (config, begun))
         except AttributeError:  # a setting of another type of optimizer
             continue
-        if name in NOT_COMPARED or value == held:
+        if name in NOT_COMPARED or value == before:
             continue
         if name.startswith(OF_OPTIMIZER):
             raise MemobenchError(
-                f"this training was begun with {name}={held}, which its saved optimizer keeps; found {value}; leave "
+                f"this training was begun with {name}={before}, which its saved optimizer keeps; found {value}; leave "
                 f"{name.removeprefix('policy.')} out, or {another}"
             )
         if not name.startswith("policy."):  # see `check_as_begun`
-            changed.append(f"{name}={value} instead of {held}")
+            changed.append(f"{name}={value} instead of {before}")
     if config.policy is not None and begun.policy is not None:
         check_as_begun(model, config.policy, begun.policy)
     done = step_reached(checkpoint)
@@ -430,22 +432,22 @@ def check_same_training(
             notify(note)
 
 
-def _check_same_dataset(found: Any, begun: Any, another: str) -> None:
+def _check_same_dataset(dataset: Any, begun: Any, another: str) -> None:
     """Refuse another dataset, other episodes or another revision than a training was begun with."""
-    roots = [Path(one.root).expanduser().resolve() if one.root else None for one in (found, begun)]
-    if roots[0] != roots[1] or (roots[0] is None and found.repo_id != begun.repo_id):
-        held = begun.root or begun.repo_id
-        moved = begun.root is not None and not Path(held).expanduser().exists()
+    roots = [Path(source.root).expanduser().resolve() if source.root else None for source in (dataset, begun)]
+    if roots[0] != roots[1] or (roots[0] is None and dataset.repo_id != begun.repo_id):
+        before = begun.root or begun.repo_id
+        moved = begun.root is not None and not Path(before).expanduser().exists()
         raise MemobenchError(
-            f"this training was begun on the dataset {held}; found {found.root or found.repo_id}; "
-            + (f"if it is the same dataset, move it or link it to {held}; else " if moved else "")
+            f"this training was begun on the dataset {before}; found {dataset.root or dataset.repo_id}; "
+            + (f"if it is the same dataset, move it or link it to {before}; else " if moved else "")
             + f"leave it out, or {another}"
         )
     for name in ("episodes", "revision"):
-        value, held = getattr(found, name), getattr(begun, name)
-        if value != held:
+        value, before = getattr(dataset, name), getattr(begun, name)
+        if value != before:
             raise MemobenchError(
-                f"this training was begun with dataset.{name}={held}; found {value}; leave it out, or {another}"
+                f"this training was begun with dataset.{name}={before}; found {value}; leave it out, or {another}"
             )
 
 
@@ -460,8 +462,8 @@ def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str |
         return None
     rates = []
     for total in (begun.steps, steps):
-        made = begun.scheduler.build(optim.SGD(nn.Linear(1, 1).parameters(), lr=1.0), total)
-        rates.append(getattr(made, "lr_lambdas", [lambda _: 1.0])[0](done) * getattr(begun.optimizer, "lr", 1.0))
+        schedule = begun.scheduler.build(optim.SGD(nn.Linear(1, 1).parameters(), lr=1.0), total)
+        rates.append(getattr(schedule, "lr_lambdas", [lambda _: 1.0])[0](done) * getattr(begun.optimizer, "lr", 1.0))
     before, after = (f"{rate:.2e}" for rate in rates)
     if before == after:
         return None
@@ -476,6 +478,6 @@ def resume_hint(config: TrainPipelineConfig, words: Mapping[str, str]) -> str:
     assert config.output_dir is not None
     if not any(complete_checkpoints(config.output_dir)):
         return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *as_command_line(words)])}"
-    kept = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
-    again = as_command_line({"output_dir": str(config.output_dir), "resume": "true", **kept})
+    options = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
+    again = as_command_line({"output_dir": str(config.output_dir), "resume": "true", **options})
     return f"go on with: {shlex.join(['lerobot', 'train', *again])}"

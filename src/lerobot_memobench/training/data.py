@@ -109,11 +109,7 @@ class Training:
 
 
 def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, LeRobotDataset | None]) -> Training:
-    """Make or load the policy of a training, compute missing features, and make the processors.
-
-    Raises:
-        MemobenchError: the dataset does not fit the policy.
-    """
+    """Make or load the policy of a training, compute missing features, and make the processors."""
     dataset, held_out = datasets
     policy_config: Any = config.policy
     set_subgoals(policy_config, dataset.meta)
@@ -129,11 +125,7 @@ def open_training(config: TrainPipelineConfig, datasets: tuple[LeRobotDataset, L
 
 
 def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotDataset | None]:
-    """Open the episodes to train on and the held-out ones, as LeRobot does, and complete their statistics.
-
-    Raises:
-        MemobenchError: the dataset lacks an episode, or another version made it.
-    """
+    """Open episodes to train on and held-out ones like LeRobot, with statistics. Errors as of `open_metadata`."""
     opened = copy.copy(config)
     opened.dataset = replace(config.dataset)
     complete_statistics(config.policy, open_metadata(opened.dataset), opened.dataset)
@@ -141,36 +133,36 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
     return train, held_out
 
 
-def open_metadata(given: DatasetConfig) -> LeRobotDatasetMetadata:
+def open_metadata(config: DatasetConfig) -> LeRobotDatasetMetadata:
     """Return the metadata of a training's dataset.
 
     Raises:
         MemobenchError: another version of this package wrote the dataset, or the dataset lacks an episode. LeRobot
             ignores a missing episode and fails if none is left.
     """
-    if given.root is not None:
-        given.root = str(without_pattern(Path(given.root)))
-    meta = LeRobotDatasetMetadata(given.repo_id, root=given.root, revision=given.revision)
+    if config.root is not None:
+        config.root = str(without_pattern(Path(config.root)))
+    meta = LeRobotDatasetMetadata(config.repo_id, root=config.root, revision=config.revision)
     if EPISODE_INFO in meta.features:
         list_episodes(Path(meta.root))  # reads all records
-    absent = [episode for episode in given.episodes or () if episode >= meta.total_episodes]
-    if absent or given.episodes == []:
+    absent = [episode for episode in config.episodes or () if episode >= meta.total_episodes]
+    if absent or config.episodes == []:
         raise MemobenchError(
-            f"found episodes={absent or given.episodes}, and the dataset {meta.root} has "
+            f"found episodes={absent or config.episodes}, and the dataset {meta.root} has "
             f"{count_of(meta.total_episodes, 'episode')}; choose from 0 to {meta.total_episodes - 1}, or leave "
             "episodes out for all"
         )
     return meta
 
 
-def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, given: Any) -> None:
+def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, config: Any) -> None:
     """Add missing statistics that a policy needs for normalisation to the dataset of LeRobot's ``DatasetConfig``."""
     root = Path(meta.root)
-    missing = lacking(root, needed_by(policy, meta.features, given.use_imagenet_stats))
+    missing = lacking(root, needed_by(policy, meta.features, config.use_imagenet_stats))
     if not missing:
         return
     if not (root / "data").is_dir():
-        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+        root = Path(LeRobotDataset(config.repo_id, root=config.root, revision=config.revision).root)
     complete(root, missing, logger.warning)
 
 
@@ -178,12 +170,12 @@ def with_features(policy: Any, features: dict[str, Any]) -> Any:
     """Return a policy's configuration with a dataset's features, as LeRobot sets them; given inputs stay."""
     unused = None if getattr(policy, "uses_pictures", True) else FeatureType.VISUAL
     known = dataset_to_policy_features(features)
-    made = copy.copy(policy)
-    made.output_features = {key: one for key, one in known.items() if one.type is FeatureType.ACTION}
-    made.input_features = dict(policy.input_features or {}) or {
-        key: one for key, one in known.items() if one.type not in (FeatureType.ACTION, unused)
+    config = copy.copy(policy)
+    config.output_features = {key: feature for key, feature in known.items() if feature.type is FeatureType.ACTION}
+    config.input_features = dict(policy.input_features or {}) or {
+        key: feature for key, feature in known.items() if feature.type not in (FeatureType.ACTION, unused)
     }
-    return made
+    return config
 
 
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
@@ -195,11 +187,11 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
     if policy is None:
         return
     if stated is not None and policy.pretrained_path is not None and not config.resume and policy.image_features:
-        found, why = trained_convention(str(policy.pretrained_path), policy)
-        if found not in (None, stated):
+        trained, why = trained_convention(str(policy.pretrained_path), policy)
+        if trained not in (None, stated):
             raise MemobenchError(
-                f"the policy {policy.pretrained_path} was trained on pictures of convention={found} ({why}), and "
-                f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {found} "
+                f"the policy {policy.pretrained_path} was trained on pictures of convention={trained} ({why}), and "
+                f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {trained} "
                 "--out <folder>`"
             )
     if not isinstance(env, MemobenchEnvConfig):
@@ -212,8 +204,8 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
             "checkpoints with `lerobot eval env=memobench`"
         )
     env.declare_plans(policy)
-    made = with_features(policy, features)
-    check_features(f"that learns from {meta.root}", made, env_to_policy_features(env), config.rename_map)
+    completed = with_features(policy, features)
+    check_features(f"that learns from {meta.root}", completed, env_to_policy_features(env), config.rename_map)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------
@@ -222,12 +214,8 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
 def open_lookup(
     root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
 ) -> FrameLookup:
-    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first.
-
-    Raises:
-        MemobenchError: the dataset lacks a column, or features cannot be computed.
-    """
-    in_data = {known: given for given, known in (renamed or {}).items()}
+    """Open the lookup of a dataset's frames; compute missing features of the policy's perception first."""
+    in_data = {known: name for name, known in (renamed or {}).items()}
     columns: dict[str, Tensor] = {}
     encoded: dict[str, Encoded] = {}
     remember: Remember | None = None
@@ -240,7 +228,7 @@ def open_lookup(
     table = with_targets(table, config, root)
     if isinstance(encoder, ImageTowerEncoder | VisualTokenEncoder):
         memory, present = picture_features(root, config, encoder, in_data)
-        encoded = {encoded_key(camera): one.of_frames for camera, one in present.items()}
+        encoded = {encoded_key(camera): features.of_frames for camera, features in present.items()}
         remember = None if memory is None else memory.tokens
     else:
         observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
@@ -274,15 +262,11 @@ def open_lookup(
 
 
 def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> None:
-    """Set the subgoals of a memory that learns from texts, and check that the dataset has all texts of the policy.
-
-    Raises:
-        MemobenchError: the dataset lacks texts, or has some that the memory does not know.
-    """
+    """Set the subgoals of a memory that learns from texts; refuse a dataset that lacks texts, or has unknown ones."""
     if config.align == NONE and not config.oracle_memory and not config.privileged_memory:
         return
     table, level = read_frame_table(Path(meta.root)), config.subgoal_level
-    levels = [one for one in LEVEL_COLUMNS if any(table.subgoals.get(one, []))]
+    levels = [name for name in LEVEL_COLUMNS if any(table.subgoals.get(name, []))]
     if config.align != NONE and level not in levels:
         fix = (
             f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
@@ -319,8 +303,7 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
 def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> FrameTable:
     """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals.
 
-    Raises:
-        MemobenchError: there is a single text to shuffle, or an episode's task is unknown.
+    A single text to shuffle and an episode of an unknown task are refused.
     """
     level, texts = config.subgoal_level, table.subgoals.get(config.subgoal_level, [])
     if config.align == NONE or not any(texts):
@@ -335,7 +318,7 @@ def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> F
     elif config.align_targets == ANSWERS:
         texts = answers(texts, table.episodes)
     elif config.align_targets == PROGRESS:
-        records = [place.record for place in list_episodes(root)]
+        records = [episode.record for episode in list_episodes(root)]
         if None in records:
             raise MemobenchError(f"The dataset {root} cannot be aligned with align_targets={PROGRESS}: {STRANGER}.")
         texts = progress(texts, table.episodes, [record.task_name for record in records if record is not None])
@@ -358,10 +341,10 @@ class DecodedSamples(Dataset[dict[str, Any]]):
     def __getitem__(self, drawn: int | tuple[int, int]) -> dict[str, Any]:
         index, number = drawn if isinstance(drawn, tuple) else (drawn, 0)
         with torch.random.fork_rng(devices=()):
-            torch.manual_seed(seed_of(self._seed, number, 0, 0))
-            found: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
-        found[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
-        return found
+            torch.manual_seed(seed_of(self._seed, number, 0, 0))  # augmentations draw from torch's generator
+            sample: dict[str, Any] = self._dataset[index if self._row is None else self._row[index]]
+        sample[f"{ACTION}_is_pad"] |= index + self._chunk >= self._lookup.run_of(index)[1]
+        return sample
 
 
 # -- processors --------------------------------------------------------------------------------------------------------
@@ -375,8 +358,8 @@ def make_training_processors(
     stats = {**meta.stats, **execution_statistics(lookup)}
     if not policy.pretrained_path:
         return make_memobench_mem_pre_post_processors(policy, stats, meta, lookup)
-    kept: dict[str, Any] = {} if config.resume else {"stats": stats}  # a resumed training keeps its statistics
-    normalized = {**kept, "norm_map": policy.normalization_mapping}
+    statistics: dict[str, Any] = {} if config.resume else {"stats": stats}  # a resumed training keeps its statistics
+    normalized = {**statistics, "norm_map": policy.normalization_mapping}
     before: dict[str, Any] = {
         "device_processor": {"device": torch.device(policy.device).type},
         "normalizer_processor": {**normalized, "features": {**policy.input_features, **policy.output_features}},
@@ -399,6 +382,6 @@ def execution_statistics(lookup: FrameLookup) -> dict[str, dict[str, Any]]:
     if not lookup.columns:
         return {}
     columns = {name: lookup.columns[name].numpy() for name in (OBS_STATE, ACTION)}
-    found = {name: get_feature_stats(one[lookup.acts], axis=0, keepdims=False) for name, one in columns.items()}
-    found[ACTION]["std"] = np.asarray(found[ACTION]["std"]) + STD_OFFSET
-    return found
+    stats = {name: get_feature_stats(values[lookup.acts], axis=0, keepdims=False) for name, values in columns.items()}
+    stats[ACTION]["std"] = np.asarray(stats[ACTION]["std"]) + STD_OFFSET
+    return stats

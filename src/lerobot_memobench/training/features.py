@@ -101,7 +101,7 @@ class EpisodeFeatures:
         numbers = np.searchsorted(self._episodes, indices, "right") - 1
         slots = (np.asarray(indices) - self._episodes[numbers]) // self._stride
         return torch.stack(
-            [self.episode(one)[slot] for one, slot in zip(numbers.tolist(), slots.tolist(), strict=True)]
+            [self.episode(number)[slot] for number, slot in zip(numbers.tolist(), slots.tolist(), strict=True)]
         )
 
     def all_frames(self) -> Tensor:
@@ -171,7 +171,7 @@ def make_features(
             images = pool.map(functools.partial(read, number), parts)
             encoded = torch.cat([features.make(part).to("cpu", torch.bfloat16) for part in images])
             write_file(episode_file(folder, number), save({TOKENS: encoded.contiguous()}))
-            progress(sum(episode_file(folder, one).is_file() for one in range(table.num_episodes)), table.num_episodes)
+            progress(sum(episode_file(folder, k).is_file() for k in range(table.num_episodes)), table.num_episodes)
     while not all(episode_file(folder, number).is_file() for number in missing):  # other processes encode these
         time.sleep(1)
     return EpisodeFeatures(folder, table.episodes, stride)
@@ -180,9 +180,9 @@ def make_features(
 def _keep_from_the_hub(root: Path) -> None:
     """Exclude caches from uploads of the dataset's folder by its ``.gitignore``, which the hub's client follows."""
     path, line = root / ".gitignore", f"/{FOLDER}/"
-    there = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    if line not in there:
-        write_file(path, "\n".join([*there, line]) + "\n")
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    if line not in lines:
+        write_file(path, "\n".join([*lines, line]) + "\n")
 
 
 def dataset_fingerprint(root: Path, camera: str) -> str:
@@ -264,7 +264,7 @@ def detected_slots(
     def read(episode: int, numbers: list[int]) -> tuple[dict[str, Tensor], Tensor]:
         columns, table = recorded()
         states = columns[state][[int(table.episodes[episode]) + number for number in numbers]]
-        return {name: one(episode, numbers) for name, one in readers.items()}, states
+        return {name: reader(episode, numbers) for name, reader in readers.items()}, states
 
     def make(observed: tuple[dict[str, Tensor], Tensor]) -> Tensor:
         slots = detect(*observed)
@@ -285,7 +285,7 @@ def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = No
         weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
             random weights of a fixed seed.
     """
-    with torch.device("meta"):
+    with torch.device("meta"):  # the language model's weights are never allocated
         model = make_backbone(config).paligemma.model
     towers = type(model.vision_tower)(model.config.vision_config), type(model.multi_modal_projector)(model.config)
     tower, projector = (part.to(torch.float32).eval().requires_grad_(False) for part in towers)

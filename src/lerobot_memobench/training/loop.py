@@ -114,7 +114,7 @@ def begin(config: TrainPipelineConfig) -> Accelerator:
     """Return accelerate's handle of this process, after seeding and settings as in LeRobot's trainer."""
     policy: Any = config.policy
     accelerator = Accelerator(
-        step_scheduler_with_optimizer=False,
+        step_scheduler_with_optimizer=False,  # else accelerate steps the schedule once for each process
         mixed_precision={"bfloat16": "bf16", "float16": "fp16", "float32": "no"}.get(policy.dtype),
         kwargs_handlers=[DistributedDataParallelKwargs(find_unused_parameters=True)],
         cpu=policy.device == "cpu",
@@ -158,8 +158,8 @@ class TrainingState:
             key for key in self.training.dataset.meta.camera_keys if key in batch and batch[key].dtype == torch.uint8
         ]
         batch |= {key: batch[key].to(torch.float32) / 255.0 for key in pictures}
-        found: dict[str, Any] = self.training.processors[0](batch)
-        return found
+        inputs: dict[str, Any] = self.training.processors[0](batch)
+        return inputs
 
     def update(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Train on a batch; return the numbers to log."""
@@ -194,13 +194,13 @@ class TrainingState:
     def held_out_loss(self, loader: Any) -> float:
         """Return the mean loss of held-out samples over all processes."""
         self.model.eval()
-        found: list[float] = []
+        losses: list[float] = []
         with self._averaged(acting=True), torch.no_grad(), self.accelerator.autocast():
             for batch in loader:
                 loss, _ = self.model(self.preprocessed(batch))
-                found.append(loss.item())
+                losses.append(loss.item())
         self.model.train()
-        mean = torch.tensor(sum(found) / max(len(found), 1), device=self.accelerator.device)
+        mean = torch.tensor(sum(losses) / max(len(losses), 1), device=self.accelerator.device)
         return float(self.accelerator.reduce(mean, reduction="mean").item())
 
     def save(self, step: int) -> Path:
@@ -236,7 +236,7 @@ class TrainingState:
         before, after = config.env.get_env_processors()
         try:
             with self._averaged(acting=True), torch.no_grad(), self.accelerator.autocast():
-                found: Mapping[str, Any] = eval_policy_all(
+                rates: Mapping[str, Any] = eval_policy_all(
                     envs=environments,
                     policy=self.accelerator.unwrap_model(self.model),
                     env_preprocessor=before,
@@ -252,7 +252,7 @@ class TrainingState:
         finally:
             close_envs(environments)
         self.model.train()
-        return found
+        return rates
 
     def push(self) -> None:
         """Upload the model and its processors to the hub."""
@@ -438,11 +438,11 @@ class TrainingLog:
             logger.info("step %d: eval_loss=%.4f", step, loss)
             self._send(step, {"eval_loss": loss}, "eval")
 
-    def write_evaluation(self, step: int, found: Mapping[str, Any]) -> None:
+    def write_evaluation(self, step: int, by_suite: Mapping[str, Any]) -> None:
         """Write the rates of rollouts."""
-        for suite, rates in found.items():
+        for suite, rates in by_suite.items():
             logger.info("Suite %s aggregated: %s", suite, rates)
-        overall = found["overall"]
+        overall = by_suite["overall"]
         self._send(step, {name: overall[name] for name in ("avg_sum_reward", "pc_success", "eval_s")}, "eval")
         if self._wandb is not None and overall.get("video_paths"):
             self._wandb.log_video(overall["video_paths"][0], step, mode="eval")

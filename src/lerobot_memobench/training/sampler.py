@@ -86,8 +86,7 @@ def seed_of(*numbers: int, dtype: type[np.uint32 | np.uint64] = np.uint32) -> in
 def grouped_order(ends: np.ndarray, together: int, generator: torch.Generator) -> Tensor:
     """Return a random order of 0 ... N - 1 in which ``together`` entries of an episode are in a row.
 
-    Args:
-        ends: (E,) end of each episode's entries; the last is N.
+    ``ends`` (E,) are the ends of the episodes' entries; the last is N.
     """
     lengths = torch.from_numpy(np.diff(ends, prepend=0))
     episode = torch.repeat_interleave(lengths)
@@ -136,7 +135,7 @@ def task_weights(
     Raises:
         MemobenchError: the dataset lacks a name, or all weights are 0.
     """
-    records = [place.record for place in list_episodes(Path(meta.root))]
+    records = [episode.record for episode in list_episodes(Path(meta.root))]
     texts = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
     names = [text if record is None else record.task_name for record, text in zip(records, texts, strict=True)]
     tasks, numbers = np.unique(names, return_inverse=True)
@@ -153,9 +152,9 @@ def task_weights(
                 f"policy.task_weights names '{name}'; expected a task or memory type of the dataset {meta.root}, or "
                 f"'{PROMPTED}'; {nearest(name, known)}"
             )
-    found = np.array([next((weights[key] for key in row if key in weights), 1.0) for row in keys])
-    if not found.any():
+    by_task = np.array([next((weights[key] for key in row if key in weights), 1.0) for row in keys])
+    if not by_task.any():
         raise MemobenchError(
             f"policy.task_weights={dict(weights)} gives every task of {meta.root} the weight 0; set one above 0"
         )
-    return numbers, found
+    return numbers, by_task

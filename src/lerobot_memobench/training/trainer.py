@@ -62,10 +62,10 @@ def prepare(
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
     """
     config = copy.deepcopy(config)
-    given, policy = config.dataset, config.policy
+    dataset, policy = config.dataset, config.policy
     if policy is None:
         return config
-    meta = open_metadata(given)
+    meta = open_metadata(dataset)
     options = view_options(policy, meta.features, prompt_frames, obs_type)
     features = {new: meta.features[name] for name, new in options.columns(meta.features).items()}
     if policy.pretrained_path is not None and not config.rename_map:
@@ -82,51 +82,52 @@ def prepare(
             f"them; evaluate it with observation_height={height} observation_width={width}"
         )
     changed = needs_view(meta.features, options)
-    if given.streaming and not (Path(meta.root) / "data").is_dir():
+    if dataset.streaming and not (Path(meta.root) / "data").is_dir():
         if changed:
             raise MemobenchError(
-                f"dataset.streaming=true reads {given.repo_id} from the hub with its prompts and all of its columns; "
+                f"dataset.streaming=true reads {dataset.repo_id} from the hub with its prompts and all of its columns; "
                 "leave dataset.streaming out"
             )
         return config
-    complete_statistics(policy, meta, given)
+    complete_statistics(policy, meta, dataset)
     if options.prompts and not policy.input_features and not chooses_inputs(policy):
         policy.input_features = {  # the view has the clock, which is not an input
-            name: one
-            for name, one in dataset_to_policy_features(features).items()
-            if one.type is not FeatureType.ACTION and name not in CLOCK
+            name: feature
+            for name, feature in dataset_to_policy_features(features).items()
+            if feature.type is not FeatureType.ACTION and name not in CLOCK
         }
     if not changed:
         return config
     root = Path(meta.root)
     if not (root / "data").is_dir():
-        root = Path(LeRobotDataset(given.repo_id, root=given.root, revision=given.revision).root)
+        root = Path(LeRobotDataset(dataset.repo_id, root=dataset.root, revision=dataset.revision).root)
     folder = cached_view(root, options)
     frames = "all frames" if options.prompts else "without the frames of prompts and holds"
     notify(f"LeRobot's trainer reads {folder}: {frames}, {options.obs_type or 'all observations'}")
-    if given.episodes is not None:
-        sources = LeRobotDatasetMetadata(given.repo_id, root=folder).episodes[SOURCE_EPISODE]
-        given.episodes = [number for number, source in enumerate(sources) if source in given.episodes]
-    given.root = str(folder)
+    if dataset.episodes is not None:
+        sources = LeRobotDatasetMetadata(dataset.repo_id, root=folder).episodes[SOURCE_EPISODE]
+        dataset.episodes = [number for number, source in enumerate(sources) if source in dataset.episodes]
+    dataset.root = str(folder)
     return config
 
 
 def check_inputs(policy: Any, meta: Any, features: dict[str, Any], renamed: Mapping[str, str]) -> None:
     """Refuse inputs that a policy cannot have, such as two cameras of VQ-BeT; LeRobot does after opening the data."""
-    made = with_features(policy, features)
-    read, there = [*made.image_features], {renamed.get(name, name): name for name in cameras_of(features)}
-    missing, free = ([name for name in one if name not in other] for one, other in ((read, there), (there, read)))
+    config = with_features(policy, features)
+    read, cameras = [*config.image_features], {renamed.get(name, name): name for name in cameras_of(features)}
+    missing = [name for name in read if name not in cameras]
+    free = [name for name in cameras if name not in read]
     if missing and free:
-        guess = json.dumps(dict(zip((there[name] for name in free), missing, strict=False)))
+        guess = json.dumps(dict(zip((cameras[name] for name in free), missing, strict=False)))
         raise MemobenchError(
             f"the policy {policy.pretrained_path or policy.type} reads {', '.join(read)}, and {meta.root} has "
-            f"{', '.join(there.values())}; map its names, for example by rename_map='{guess}'"
+            f"{', '.join(cameras.values())}; map its names, for example by rename_map='{guess}'"
         )
     try:
-        made.validate_features()
+        config.validate_features()
     except ValueError as error:
         raise MemobenchError(
-            f"policy={policy.type} cannot read {', '.join(made.input_features)} of {meta.root}: {error} Choose its "
+            f"policy={policy.type} cannot read {', '.join(config.input_features)} of {meta.root}: {error} Choose its "
             "inputs by policy.input_features"
         ) from None
 
@@ -168,7 +169,7 @@ def open_trainer_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
         config.env.declare_plans(config.policy)
     datasets: tuple[Any, Any] = make_train_eval_datasets(config)
     inputs = getattr(config.policy, "input_features", None) or {}
-    pictures = [name for name, one in inputs.items() if one.type is FeatureType.VISUAL]
+    pictures = [name for name, feature in inputs.items() if feature.type is FeatureType.VISUAL]
     reads_pictures = bool(pictures if inputs else datasets[0].meta.camera_keys)
     if config.policy is not None and not config.dataset.streaming and not reads_pictures:
         for dataset in datasets:
@@ -196,9 +197,9 @@ def keep_in_memory(dataset: Any) -> None:
     # A reader may have some episodes only.
     starts = np.flatnonzero(np.diff(columns["episode_index"].numpy(), prepend=-1))
     bounds = np.append(starts, len(table))
-    held = SamplesInMemory(columns, bounds, reader.delta_indices or {}, dataset.meta.tasks.index.tolist(), texts)
-    reader.get_item = held.__getitem__
-    dataset.__getitems__ = held.__getitems__  # torch's loader asks for a batch at once
+    samples = SamplesInMemory(columns, bounds, reader.delta_indices or {}, dataset.meta.tasks.index.tolist(), texts)
+    reader.get_item = samples.__getitem__
+    dataset.__getitems__ = samples.__getitems__  # torch's loader asks for a batch at once
 
 
 def _tensor(column: Any, like: Tensor) -> Tensor:

@@ -69,18 +69,14 @@ class ViewOptions:
     convention: str | None = None
 
     def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
-        """Return the view's columns: name in the dataset -> name in the view.
-
-        Raises:
-            MemobenchError: the dataset lacks the observations.
-        """
+        """Return name in the dataset -> name in the view; refuse a dataset that lacks the observations."""
         cameras = cameras_of(features)
         objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
         dropped = set() if self.prompts else {*CLOCK}
         if (self.obs_type in (OBJECTS, BOTH) and not objects) or (self.obs_type in (PIXELS, BOTH) and not cameras):
-            found = ", ".join(cameras + objects) or "neither pictures nor objects"
+            inputs = ", ".join(cameras + objects) or "neither pictures nor objects"
             raise MemobenchError(
-                f"found obs_type={self.obs_type}, and the dataset has {found}; choose another obs_type, or generate a "
+                f"found obs_type={self.obs_type}, and the dataset has {inputs}; choose another obs_type, or generate a "
                 "dataset that has it"
             )
         if self.obs_type == OBJECTS:
@@ -89,27 +85,23 @@ class ViewOptions:
             dropped |= {OBJECTS_COLUMN}
         renamed = {PRIVILEGED: OBJECTS_COLUMN} if self.obs_type in (OBJECTS, BOTH) else {}
         if self.mirrors(features):
-            old, new = (CONVENTIONS[one] for one in (OTHER[str(self.convention)], str(self.convention)))
+            old, new = (CONVENTIONS[convention] for convention in (OTHER[str(self.convention)], str(self.convention)))
             renamed |= {image_key(old[camera]): image_key(new[camera]) for camera in CAMERAS}
         return {name: renamed.get(name, name) for name in features if name not in dropped}
 
     def mirrors(self, features: Mapping[str, Any]) -> bool:
-        """Return whether the view's pictures are those of the dataset, mirrored left to right.
-
-        Raises:
-            MemobenchError: the view has no pictures, or the dataset's convention is unknown.
-        """
+        """Return whether the view mirrors pictures left to right; refuse a view without, or an unknown convention."""
         if self.convention is None:
             return False
-        cameras, found = cameras_of(features), convention_of(features)
+        cameras, convention = cameras_of(features), convention_of(features)
         if not cameras or self.obs_type == OBJECTS:
             raise MemobenchError(f"found convention={self.convention}, and the view has no pictures; leave it out")
-        if found is None:
+        if convention is None:
             raise MemobenchError(
                 f"found convention={self.convention}, and it is unknown whether {', '.join(cameras)} are upright or "
                 "mirrored; name a dataset of this package, or one of LIBERO with image and image2"
             )
-        return found != self.convention
+        return convention != self.convention
 
 
 def view_options(
@@ -121,7 +113,7 @@ def view_options(
     if chooses_inputs(policy):
         return ViewOptions(prompts, None)
     if begun:
-        pictures = any(one.type is FeatureType.VISUAL for one in begun.values())
+        pictures = any(feature.type is FeatureType.VISUAL for feature in begun.values())
         objects = OBJECTS_COLUMN in begun
     elif obs_type is not None:
         return ViewOptions(prompts, obs_type)
@@ -170,7 +162,7 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
     features, fps = info["features"], info["fps"]
-    kept, mirrors, is_ours = options.columns(features), options.mirrors(features), has_benchmark_columns(features)
+    columns, mirrors, is_ours = options.columns(features), options.mirrors(features), has_benchmark_columns(features)
     stretches = Stretches.of(table, is_ours and not options.prompts)
     if not stretches.starts.size:
         raise MemobenchError(f"{root} has no frame whose action has an effect; name a dataset of `memobench generate`")
@@ -179,30 +171,30 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
         shutil.rmtree(build, ignore_errors=True)
         for path, rows in tables_of(root / "data"):
             with undamaged(path):
-                frames = _frames_of(rows, kept, stretches, fps)
+                frames = _frames_of(rows, columns, stretches, fps)
                 frames = _mirrored(frames) if mirrors else frames
             _write_table(frames, build / path.relative_to(root))
         for path, rows in tables_of(root / EPISODES):
-            _write_table(_episodes_of(rows, kept, stretches, fps), build / path.relative_to(root))
-        described = {new: features[name] for name, new in kept.items()}
+            _write_table(_episodes_of(rows, columns, stretches, fps), build / path.relative_to(root))
+        described = {new: features[name] for name, new in columns.items()}
         stated = options.convention if options.convention == MIRRORED or not is_ours else None
         for name in cameras_of(features):
-            if name in kept:
-                videos = build / "videos" / kept[name]
+            if name in columns:
+                videos = build / "videos" / columns[name]
                 _write_videos(root / "videos" / name, videos, fps if mirrors else None)
                 if mirrors:
-                    new = {key: one for key, one in features[name].items() if key not in ("convention", "info")}
+                    new = {key: value for key, value in features[name].items() if key not in ("convention", "info")}
                     new |= {"convention": stated} if stated else {}
                     new |= {"info": video_info(files[0])} if (files := files_below(videos, ".mp4")) else {}
-                    described[kept[name]] = new
+                    described[columns[name]] = new
         count = len(stretches.starts)
         info |= {"features": described, "total_episodes": count, "total_frames": int(stretches.lengths.sum())}
         info["splits"] = {"train": f"0:{count}"}
         write_file(build / INFO_FILE, json.dumps(info, indent=4))
-        stats = {kept[name]: one for name, one in recorded(root).items() if name in kept}
+        stats = {columns[name]: values for name, values in recorded(root).items() if name in columns}
         write_file(build / STATS_FILE, json.dumps(stats))
         shutil.copyfile(root / TASKS_FILE, build / TASKS_FILE)
-        build.rename(out)
+        build.rename(out)  # complete at once: `cached_view` uses a view that exists
 
 
 class Stretches(NamedTuple):
@@ -231,7 +223,7 @@ class Stretches(NamedTuple):
         return cls(starts, lengths, np.cumsum(lengths) - lengths, sources, starts - table.episodes[sources])
 
 
-def _frames_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
+def _frames_of(rows: pa.Table, columns: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
     """Return the view's rows and columns of a data file, with new numbers."""
     index = rows.column("index").to_numpy()
     number = np.searchsorted(stretches.starts, index, "right") - 1
@@ -250,8 +242,8 @@ def _frames_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, fp
     if LANGUAGE in rows.column_names:
         texts = _earlier(rows.column(LANGUAGE).combine_chunks(), stretches.offsets[number] / fps)
         rows = rows.set_column(rows.column_names.index(LANGUAGE), LANGUAGE, texts)
-    there = [name for name in rows.column_names if name in kept]
-    return rows.select(there).rename_columns([kept[name] for name in there])
+    present = [name for name in rows.column_names if name in columns]
+    return rows.select(present).rename_columns([columns[name] for name in present])
 
 
 def _with_values(rows: pa.Table, changed: Mapping[str, np.ndarray]) -> pa.Table:
@@ -264,7 +256,7 @@ def _with_values(rows: pa.Table, changed: Mapping[str, np.ndarray]) -> pa.Table:
 def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
     """Return LeRobot's language rows (N,) with timestamps reduced by seconds (N,)."""
     lengths, rows = pc.list_value_length(texts).fill_null(0).to_numpy(zero_copy_only=False), texts.flatten()
-    columns = {field.name: rows.field(place) for place, field in enumerate(rows.type)}
+    columns = {field.name: rows.field(number) for number, field in enumerate(rows.type)}
     kind = columns["timestamp"].type
     columns["timestamp"] = pc.subtract(columns["timestamp"], pa.array(np.repeat(seconds, lengths), kind))
     offsets = pa.array(np.concatenate([[0], np.cumsum(lengths)]), pa.int32())
@@ -273,10 +265,10 @@ def _earlier(texts: pa.ListArray, seconds: np.ndarray) -> pa.ListArray:
 
 def _mirrored(frames: pa.Table) -> pa.Table:
     """Return frames with LeRobot's images mirrored left to right, as PNG."""
-    for place, field in enumerate(frames.schema):
+    for number, field in enumerate(frames.schema):
         if field.name.startswith(OBS_IMAGES) and pa.types.is_struct(field.type):
-            rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(place).to_pylist()]
-            frames = frames.set_column(place, field, pa.array(rows, field.type))
+            rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(number).to_pylist()]
+            frames = frames.set_column(number, field, pa.array(rows, field.type))
     return frames
 
 
@@ -289,19 +281,19 @@ def _mirrored_image(content: bytes) -> bytes:
 def _write_videos(source: Path, out: Path, mirrored_at: int | None) -> None:
     """Write a camera's videos: links to the dataset's, copies without support of links, or mirrored ones (frames/s)."""
     for path in files_below(source, ".mp4"):
-        place = out / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
+        target = out / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
         if mirrored_at is not None:
             with undamaged(path):
-                mirror_video(path, place, mirrored_at)
+                mirror_video(path, target, mirrored_at)
             continue
         try:
-            place.symlink_to(path.resolve())
+            target.symlink_to(path.resolve())
         except OSError:
-            shutil.copyfile(path, place)
+            shutil.copyfile(path, target)
 
 
-def _episodes_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
+def _episodes_of(rows: pa.Table, columns: Mapping[str, str], stretches: Stretches, fps: float) -> pa.Table:
     """Return the view's rows of a file of the episodes' table: numbers, bounds of frames, and times in the videos."""
     numbers = rows.column("episode_index").to_numpy()
     chosen = np.flatnonzero(np.isin(stretches.sources, numbers))
@@ -321,7 +313,9 @@ def _episodes_of(rows: pa.Table, kept: Mapping[str, str], stretches: Stretches, 
     rows = rows.select([name for name in names if name != SOURCE_EPISODE])  # a view of a view has it
     rows = _with_values(rows.append_column(SOURCE_EPISODE, rows.column("episode_index")), changed)
     parts = [name.split("/") for name in rows.column_names]  # videos/<camera>/<place>
-    names = ["/".join(kept.get(one, one) if at == 1 else one for at, one in enumerate(each)) for each in parts]
+    names = [
+        "/".join(columns.get(part, part) if at == 1 else part for at, part in enumerate(segments)) for segments in parts
+    ]
     return rows.rename_columns(names).replace_schema_metadata(None)
 
 
