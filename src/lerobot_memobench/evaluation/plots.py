@@ -293,7 +293,7 @@ def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
     """
     from matplotlib.lines import Line2D
 
-    groups = [group for group in GAPS if any(group in each for each in by_gap.values())]
+    groups = [group for group in GAPS if any(group in counts for counts in by_gap.values())]
     styles = {name: line_style(number, published=False) for number, name in enumerate(by_gap)}
     with paper_style():
         figure = new_figure(5.0, 2.7)

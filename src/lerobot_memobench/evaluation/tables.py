@@ -347,7 +347,7 @@ class Unbroken:
         columns = self.table.columns
         after = columns[self.column + 1 :]
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
-        least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
+        least, most = ([max(size[end] for size in sizes) for sizes in wished] for end in (0, 1))
         space = room - INDENT * len(after)
         last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes the remaining width
         widths = [*most[:-1], last] if last >= least[-1] else least
@@ -394,8 +394,8 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
     if table.best:
         result.caption = "* best of its column"
         result.caption_justify = "left"
-    named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
-    return result if named is None else Unbroken(result, named)
+    names_at = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
+    return result if names_at is None else Unbroken(result, names_at)
 
 
 def _in_parts(table: Table) -> list[Table]:
