@@ -64,8 +64,8 @@ def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool
     """
     check_evaluation(control, part=part, control=name)
     for key in ("type", "sha256", "settings"):
-        mine, other = (each.card[POLICY].get(key) for each in (run, control))
-        if mine != other:
+        of_run, of_control = (evaluation.card[POLICY].get(key) for evaluation in (run, control))
+        if of_run != of_control:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
     if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
         raise MemobenchError(f"{run.place} and {control.place} differ in {unlike[0]}; evaluate with the same settings")
@@ -106,10 +106,10 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
             f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
             f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
         )
-    asked = set(itertools.product(names, range(count)))
-    there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
-    for task, episode in sorted(asked ^ there)[:1]:
-        problem = "is missing in the log" if (task, episode) in asked else "is not part of the protocol"
+    requested = set(itertools.product(names, range(count)))
+    logged = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
+    for task, episode in sorted(requested ^ logged)[:1]:
+        problem = "is missing in the log" if (task, episode) in requested else "is not part of the protocol"
         raise MemobenchError(
             f"{run.place}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
             f"{len(names)} tasks"
@@ -134,10 +134,10 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
                     f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
                 )
     for name in names:
-        here, there = task_hash(get_task(name)), run.card["task_files"].get(name)
-        if here != there:
+        here, stored = task_hash(get_task(name)), run.card["task_files"].get(name)
+        if here != stored:
             raise MemobenchError(
-                f"{run.place}: the files of {name} have the hash {str(there)[:16]} on the card and {here} in this "
+                f"{run.place}: the files of {name} have the hash {str(stored)[:16]} on the card and {here} in this "
                 "version; evaluate with this version"
             )
 

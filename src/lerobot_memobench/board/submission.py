@@ -143,8 +143,8 @@ class Evaluation:
     @property
     def protocol(self) -> dict[str, Any]:
         """The protocol of the card."""
-        found: dict[str, Any] = self.card["protocol"]
-        return found
+        protocol: dict[str, Any] = self.card["protocol"]
+        return protocol
 
     @property
     def run(self) -> Run:
@@ -181,14 +181,14 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
     for control in {*CONTROLS} - {*evaluations}:
         shutil.rmtree(folder / control, ignore_errors=True)
     for control, source in evaluations.items():
-        place = folder / control
+        target = folder / control
         evaluation = own_evaluation(source)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
-        write_evaluation(place, {**evaluation.card, **block})
+        write_evaluation(target, {**evaluation.card, **block})
         packed = io.BytesIO()
         with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
             file.write(log_text(evaluation.records).encode())
-        write_file(place / LOG, packed.getvalue())
+        write_file(target / LOG, packed.getvalue())
     return folder
 
 

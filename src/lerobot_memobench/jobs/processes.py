@@ -185,12 +185,12 @@ def _kill_descendants() -> None:
 
 def _descendants() -> set[psutil.Process]:
     """Return the descendants of this process, except multiprocessing's resource tracker, which cleans up."""
-    found = set()
+    descendants = set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
             if not any("resource_tracker" in word for word in process.cmdline()):
-                found.add(process)
-    return found
+                descendants.add(process)
+    return descendants
 
 
 class HeldError(MemobenchError):

@@ -216,9 +216,9 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
     if not has_log(folder):
         return card
     earlier = read_evaluation(folder)
-    if found := differences_of_parts(earlier, card):
+    if unlike := differences_of_parts(earlier, card):
         raise MemobenchError(
-            f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
+            f"{folder} holds an evaluation with another protocol ({'; '.join(unlike)}, there and now); repeat its "
             "settings to resume it, or choose another output_dir="
         )
     if "runs" not in earlier:  # LeRobot's own command wrote it
@@ -237,11 +237,11 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
 def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """Return the differences of two starts on which numbers may depend: the batch size, and the first version."""
     sizes = {"batch_size": earlier["batch_size"]}, {"batch_size": now["batch_size"]}
-    found = []
-    for there, here in (sizes, (earlier["versions"], now["versions"])):
-        changed = [f"{key} {there[key]}, now {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
-        found += changed[:1]
-    return found
+    differences = []
+    for old, new in (sizes, (earlier["versions"], now["versions"])):
+        changed = [f"{key} {old[key]}, now {new[key]}" for key in new if old.get(key, new[key]) != new[key]]
+        differences += changed[:1]
+    return differences
 
 
 def missing(plan: EvaluationPlan) -> list[Cell]:

@@ -127,8 +127,8 @@ class EvaluationPlan:
 
 def with_changes(line: Sequence[str], **changes: object) -> list[str]:
     """Return a command line in which these keys have other values; None removes one."""
-    given = {key: str(value) for key, value in changes.items() if value is not None}
-    return as_command_line(without(parse_words(line), *changes) | given)
+    values = {key: str(value) for key, value in changes.items() if value is not None}
+    return as_command_line(without(parse_words(line), *changes) | values)
 
 
 # --- making it ---
@@ -143,8 +143,8 @@ def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation for the words of a command line."""
     from lerobot_memobench.rollouts.settings import read_settings
 
-    options, others = take_run_options(words)
-    return make_plan(read_settings(others), options, ("lerobot", "eval", *as_command_line(words)))
+    options, setting_words = take_run_options(words)
+    return make_plan(read_settings(setting_words), options, ("lerobot", "eval", *as_command_line(words)))
 
 
 def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
@@ -164,8 +164,8 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
     settings = with_device(with_policy(settings), options)
     policy = policy_of(settings)
     check_expert(policy, settings.env.get("suite", PUBLISHED))
-    named = settings.env.get("convention") or (MIRRORED if settings.env.get("camera_name_mapping") else None)
-    convention = chosen_convention(settings.policy_path, policy, named, settings.rename_map)
+    requested = settings.env.get("convention") or (MIRRORED if settings.env.get("camera_name_mapping") else None)
+    convention = chosen_convention(settings.policy_path, policy, requested, settings.rename_map)
     settings = settings if convention is None else replace(settings, env={**settings.env, "convention": convention})
     output = _output(settings, options, policy)
     log = Path(settings.env.get("log_dir") or output)
@@ -202,8 +202,8 @@ def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTraine
     if settings.output_dir is not None:
         return Path(settings.output_dir) / (options.shard.folder if options.shard is not None else "")
     base = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_memobench_{policy.type}"
-    others = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
-    return next(folder for folder in itertools.chain([base], others) if not folder.exists())
+    numbered = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
+    return next(folder for folder in itertools.chain([base], numbered) if not folder.exists())
 
 
 # --- checks of a plan ---
@@ -395,12 +395,12 @@ def with_batch_size(
     suit the cores and divide the episodes. A resumed run keeps its number, because a policy's samples may depend on it.
     Parts run one environment each: by cores, each machine would divide the evaluation differently.
     """
-    given, episodes = settings.batch_size or 0, settings.episodes or 1
-    if given < 0:
+    requested, episodes = settings.batch_size or 0, settings.episodes or 1
+    if requested < 0:
         raise MemobenchError(
-            f"found batch_size={given}; expected at least 1 environment at once, or 0 to choose by the machine"
+            f"found batch_size={requested}; expected at least 1 environment at once, or 0 to choose by the machine"
         )
-    if given:
+    if requested:
         return settings
     if options.resume and (earlier := earlier_batch_size(log)) is not None:
         return replace(settings, batch_size=earlier)
@@ -549,8 +549,8 @@ class Grid:
 
     def cells(self, shard: Shard | None = None) -> list[Cell]:
         """Return the batches of a shard, or all. A batch is never divided: the policy acts on it as a whole."""
-        found = [(task, number) for task in self.tasks for number in range(-(-self.runs // self.batch))]
-        return found if shard is None else found[shard.of(len(found))]
+        cells = [(task, number) for task in self.tasks for number in range(-(-self.runs // self.batch))]
+        return cells if shard is None else cells[shard.of(len(cells))]
 
     def runs_of(self, number: int) -> range:
         """Return the runs of a task's batch."""

@@ -81,10 +81,10 @@ def repeat(
         say(f"note: {note}")
     plan = plan_of_evaluation(card, settings, out)
     here = plan.environment.settings.protocol_block
-    if found := differences(card["protocol"], here):
+    if changes := differences(card["protocol"], here):
         start = card["runs"][-1]
         raise MemobenchError(
-            f"another version ran the card ({'; '.join(found)}, there and here); repeat it with that version "
+            f"another version ran the card ({'; '.join(changes)}, there and here); repeat it with that version "
             f"({start['versions'].get(PACKAGES[0], 'not known')}, commit {start['git_commit'] or 'not known'})"
         )
     episodes = read_log(path if path.is_dir() else path.parent)
@@ -149,8 +149,8 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
             "command yourself if you trust it"
         )
     wanted = {episode for cell in grid.cells(plan.options.shard) for episode in grid.episodes(cell)}
-    named = {key_of(each) for each in episodes if "not_run" in each or "steps" in each}
-    for task, episode in sorted(wanted ^ named)[:1]:
+    logged = {key_of(record) for record in episodes if "not_run" in record or "steps" in record}
+    for task, episode in sorted(wanted ^ logged)[:1]:
         problem = "log lacks" if (task, episode) in wanted else "card does not ask for"
         raise MemobenchError(
             f"the {problem} {task}, episode {episode}; expected the outcome of each of the "
@@ -175,11 +175,11 @@ def check_policy(card: Mapping[str, Any], path: str | None) -> None:
             policy.get("detector_sha256"),
         ),
     )
-    for name, here, there in pairs:
-        if here != there:
+    for name, here, stored in pairs:
+        if here != stored:
             raise MemobenchError(
-                f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(there)[:12]} on the card); "
-                "the results would be those of another policy"
+                f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(stored)[:12]} on the "
+                "card); the results would be those of another policy"
             )
 
 
@@ -294,8 +294,8 @@ def _are_here(text: str) -> bool:
 def _is_device_here(text: str) -> bool:
     import torch
 
-    found = DEVICE.fullmatch(text)
-    return found is not None and int((found[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
+    match = DEVICE.fullmatch(text)
+    return match is not None and int((match[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
 
 
 TEXTS: dict[str, tuple[Callable[[str], Any], str]] = {
