@@ -40,14 +40,11 @@ REQUIRED = {
 
 
 def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") -> None:
-    """Check an evaluation: settings, episodes, seeds, versions.
+    """Check an evaluation: settings, episodes, seeds, versions. The error names the first rule that it breaks.
 
     Args:
         part: whether any tasks of the suite, and any number of their episodes, are enough.
         control: name of the control that it is, of `CONTROL_SETTING`.
-
-    Raises:
-        MemobenchError: naming the first rule that it breaks.
     """
     _check_settings(run, **CONTROL_SETTING.get(control, {}))
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
@@ -57,11 +54,7 @@ def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") 
 
 
 def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool = False) -> None:
-    """Check an evaluation of the same policy under a control, as `check_evaluation` does.
-
-    Raises:
-        MemobenchError: it breaks a rule, or has another policy or other settings.
-    """
+    """Check an evaluation under a control as `check_evaluation` does, and that policy and settings are the same."""
     check_evaluation(control, part=part, control=name)
     for key in ("type", "sha256", "settings"):
         of_run, of_control = (evaluation.card[POLICY].get(key) for evaluation in (run, control))

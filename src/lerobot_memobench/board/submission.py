@@ -105,10 +105,8 @@ class About(BaseModel):
     Attributes:
         model: name of the policy, as the board shows it.
         submitter: person or team; ``@name`` for a GitHub account.
-        date: of the submission.
         training_data: origin and size of the demonstrations.
         parameters: number of parameters; None if unknown, 0 for a scripted policy.
-        links: addresses of code, weights and paper.
         without_memory: row of the board with a policy of the same kind that has no memory.
     """
 
@@ -203,11 +201,7 @@ PROMISES = (
 
 
 def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
-    """Return the text in Markdown: files, statements of the submitter, promises to confirm, report of the evaluation.
-
-    Args:
-        name: of the row's folder.
-    """
+    """Return the text in Markdown: files, statements of the submitter, promises to confirm, the evaluation's report."""
     stated = about.model_dump(exclude_none=True)
     stated |= stated.pop("links")
     lines = [

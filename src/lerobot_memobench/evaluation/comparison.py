@@ -423,11 +423,7 @@ def comparison_report(comparison: Comparison) -> Report:
 
 
 def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
-    """Return the tables of a comparison, with a title.
-
-    Args:
-        overall: the average and memory types alone.
-    """
+    """Return the tables of a comparison, with a title; ``overall`` leaves tasks and families out."""
     kinds = {contrast.kind for contrast in comparison.contrasts}
     tables = [_table(comparison, *spec) for spec in TABLES[: 1 if overall else None] if kinds & {*spec[2]}]
     if MEMORY_TYPE not in kinds:
@@ -438,11 +434,7 @@ def comparison_section(comparison: Comparison, overall: bool = False) -> Section
 
 
 def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
-    """Return a comparison as JSON values.
-
-    Args:
-        overall: the average and memory types alone.
-    """
+    """Return a comparison as JSON values; ``overall`` leaves tasks and families out."""
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
         "a": comparison.runs[0].name,

@@ -362,7 +362,6 @@ class TaskSummary:
         operations: labels of the checkpoints, such as "SUU".
         prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any order.
         ordered_prefix: the same in order.
-        failures: class -> number of failed rollouts.
     """
 
     memory_type: str

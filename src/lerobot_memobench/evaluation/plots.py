@@ -286,10 +286,9 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
 
 
 def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
-    """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals.
+    """Draw the rate of reached checkpoints over their gap with Wilson's intervals, a line per evaluation.
 
-    Args:
-        by_gap: name of an evaluation -> its `success_by_gap`.
+    ``by_gap`` maps its name to its `success_by_gap`.
     """
     from matplotlib.lines import Line2D
 

@@ -180,11 +180,7 @@ def _with_suites_joined(runs: Sequence[Run]) -> Sequence[Run]:
 
 
 def _joined(parts: Sequence[Run]) -> Run:
-    """Return evaluations of one policy, each in another suite of LIBERO, as one.
-
-    Raises:
-        MemobenchError: they are of several policies, or two are of one suite.
-    """
+    """Return evaluations of one policy, each in another suite of LIBERO, as one; raise for several policies."""
     if len(parts) == 1:
         return parts[0]
     parts = sorted(parts, key=lambda part: GROUPS.index(part.suites[0]))

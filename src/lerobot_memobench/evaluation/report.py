@@ -61,13 +61,7 @@ def write_report(directory: str | Path) -> Run:
     """Read the log under ``directory`` and write ``report.json`` and ``report.md`` into it.
 
     ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
-    another process may write to it.
-
-    Returns:
-        The evaluation with warnings, see `read_run`.
-
-    Raises:
-        MemobenchError: see `read_run`.
+    another process may write to it. Return the evaluation with warnings, see `read_run`.
     """
     directory = Path(directory)
     run = read_run(directory)
@@ -495,11 +489,7 @@ def granularity_section(runs: Sequence[Run], levels: Mapping[str, tuple[str, Sum
 
 
 def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
-    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs.
-
-    Raises:
-        MemobenchError: a rollout has another number of checkpoints than its task.
-    """
+    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs."""
     index = LEVELS.index(level)
     result: list[Record] = []
     for record in records:

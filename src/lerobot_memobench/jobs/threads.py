@@ -46,7 +46,6 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
 
     Args:
         role: `ACTING` or `LEARNING`.
-        processes: number of processes that share the cores.
         large: whether the acting policy has `LARGE` parameters or more.
     """
     if role == ACTING and not large:

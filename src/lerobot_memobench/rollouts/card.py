@@ -100,9 +100,6 @@ def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any
 
     They are its configuration as LeRobot encodes it, the seed of the run and, as a detector is not part of a
     checkpoint, the detector's hash.
-
-    Raises:
-        MemobenchError: the detector does not exist.
     """
     recorded = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
     detector = detector_hash(recorded)
@@ -115,11 +112,7 @@ def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any
 
 
 def detector_hash(settings: Mapping[str, Any]) -> str | None:
-    """Return the hash of the detector that a policy reads objects from, None without one.
-
-    Raises:
-        MemobenchError: the detector does not exist.
-    """
+    """Return the hash of the detector that a policy reads objects from, None without one; raise if it is missing."""
     if settings.get("detector") is None:
         return None
     from lerobot_memobench.perception.weights import detector_file

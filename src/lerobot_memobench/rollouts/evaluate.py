@@ -58,7 +58,6 @@ def run_evaluation(
     Args:
         note: called with notes, and with the command that resumes a run that breaks off.
         begin: called with a line on the evaluation before it starts.
-        advance: see `Advance`.
 
     Raises:
         MemobenchError: the folder holds another evaluation, or weights are missing. Any error of LeRobot.
@@ -119,9 +118,6 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     Args:
         cells: the batches, those of one task in succession.
         begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
-
-    Raises:
-        MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
     """
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
@@ -298,11 +294,7 @@ def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and lock it while it is written to; afterwards new folders that are empty are removed.
-
-    Raises:
-        MemobenchError: another run writes to it, or it is a file.
-    """
+    """Make a folder and lock it, see `locked`; afterwards new folders that are empty are removed."""
     check_folder(folder)
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)

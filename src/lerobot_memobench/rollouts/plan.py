@@ -62,12 +62,9 @@ class EvaluationPlan:
 
     Attributes:
         settings: complete settings, equal to those of the card.
-        policy: configuration of the policy.
-        environment: configuration of the environment.
         grid: episodes of each task, in batches.
         output: folder of the evaluation, or of its part (``shard=``).
         log: folder of the episode log, the report and the card.
-        options: options of the run, such as shards and memory reads.
         command: the typed command line, for the card.
     """
 
@@ -148,11 +145,7 @@ def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
 
 
 def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
-    """Complete the settings of the benchmark's evaluation and check them.
-
-    Raises:
-        MemobenchError: it cannot be run.
-    """
+    """Complete the settings of the benchmark's evaluation and check them; raise if it cannot be run."""
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.rollouts.settings import policy_of, with_policy
     from lerobot_memobench.sim.files import check_assets
@@ -185,11 +178,7 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
 
 
 def make_grid(settings: EvaluationSettings, environment: MemobenchEnvConfig) -> Grid:
-    """Return the episodes of an evaluation.
-
-    Raises:
-        MemobenchError: unknown tasks, or no episodes.
-    """
+    """Return the episodes of an evaluation; raise for unknown tasks, or without episodes."""
     tasks = tuple(PlannedTask(*chosen) for chosen in environment.selected())
     runs, seed = settings.episodes, settings.seed
     if runs is None or seed is None or runs < 1:
@@ -210,11 +199,9 @@ def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTraine
 
 
 def check_policy_fits(plan: EvaluationPlan) -> None:
-    """Refuse a policy whose inputs, settings or checkpoint do not suit the evaluation.
+    """Refuse a policy whose inputs, settings or memory reads do not suit the evaluation.
 
-    Raises:
-        MemobenchError: the environment lacks inputs of the policy, the checkpoint is damaged or was trained under other
-            settings, or ``memory_reads`` is asked of a policy that reports none.
+    A damaged checkpoint is refused, and one that was trained under other settings.
     """
     policy, path = plan.policy, plan.policy_path
     if path is not None:
@@ -237,11 +224,7 @@ def check_policy_fits(plan: EvaluationPlan) -> None:
 
 
 def check_corruption(plan: EvaluationPlan) -> None:
-    """Refuse ``corrupt`` for a policy that does not offer its memory, and a swap without another row.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
+    """Refuse ``corrupt`` for a policy that does not offer its memory, and a swap without another row."""
     how, policy = plan.environment.corrupt, plan.policy
     if how == INTACT:
         return
@@ -262,11 +245,7 @@ def check_corruption(plan: EvaluationPlan) -> None:
 
 
 def check_split(plan: EvaluationPlan) -> None:
-    """Refuse seeds outside the split that was named, and the sealed seeds or a salt where it was not.
-
-    Raises:
-        MemobenchError: they are refused.
-    """
+    """Refuse seeds outside the split that was named, and the sealed seeds or a salt where it was not."""
     split, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
     if plan.environment.suite in LIBERO_SUITES and split not in (None, PAPER):
         raise MemobenchError(
@@ -289,11 +268,7 @@ def check_split(plan: EvaluationPlan) -> None:
 
 
 def check_expert(policy: PreTrainedConfig, suite: str) -> None:
-    """Refuse the scripted policies in LIBERO's suites.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
+    """Refuse the scripted policies in LIBERO's suites."""
     if policy.type in SCRIPTED and suite in LIBERO_SUITES:
         raise MemobenchError(
             f"found suite={suite} with policy={policy.type}; LIBERO's tasks have no scripted expert: name a policy, "
@@ -327,10 +302,7 @@ def check_scenes(plan: EvaluationPlan) -> None:
 def with_device(settings: EvaluationSettings, options: RunOptions) -> EvaluationSettings:
     """Return settings with the CPU as the policy's device where the machine has no other.
 
-    Parts decide on their own machine: this machine may be a login node.
-
-    Raises:
-        MemobenchError: the user named a device that this machine lacks.
+    Parts decide on their own machine: this machine may be a login node. A named device that is missing raises.
     """
     import torch
 
@@ -431,7 +403,6 @@ class RunOptions:
     Attributes:
         split: the split whose seeds are run, one of `EVALUATED`; None: by `seed=`.
         memory_reads: write the weight of each remembered frame in each chunk next to the log.
-        resume: resume the evaluation in the output folder.
         shard: run this part alone.
         shards: run this many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
         workers: 0: as many as shards.
@@ -451,11 +422,7 @@ class RunOptions:
 
 
 def take_run_options(words: Mapping[str, str]) -> tuple[RunOptions, dict[str, str]]:
-    """Return the run options of a command line, and the words without them.
-
-    Raises:
-        MemobenchError: a value that an option does not accept, or options that exclude each other.
-    """
+    """Return the run options of a command line, and the other words; raise for options that exclude each other."""
     options = RunOptions(
         split=words.get("split"),
         memory_reads=value_of("memory_reads", bool, words.get("memory_reads", "false")),

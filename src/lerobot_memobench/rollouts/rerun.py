@@ -66,14 +66,10 @@ def repeat(
     """Repeat the evaluation of a card and compare every episode; return 1 where one ended differently.
 
     Args:
-        path: the card, or its folder.
+        path, server: see `read_repeatable`.
         out: folder of the repetition, a dated one when None.
-        server: see `read_repeatable`.
         evaluate: runs the plan and returns its exit status.
         say: called with differences of this machine, and with the result.
-
-    Raises:
-        MemobenchError: the card cannot be repeated here.
     """
     card, settings = read_repeatable(path, server)
     check_policy(card, settings.policy_path)
@@ -107,9 +103,6 @@ def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, An
     Args:
         path: the card's file or its folder.
         server: address of the policy's server (``host:port``, or several with commas); the card's when None.
-
-    Raises:
-        MemobenchError: there is no card, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
     return card, allowed_settings(card_settings(card), server)
@@ -159,11 +152,7 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
 
 
 def check_policy(card: Mapping[str, Any], path: str | None) -> None:
-    """Refuse to repeat an evaluation with another checkpoint or detector.
-
-    Raises:
-        MemobenchError: one of them differs, or the card does not identify it.
-    """
+    """Refuse to repeat an evaluation with another checkpoint or detector, or without their hashes on the card."""
     if path is None:
         return
     policy = card["policy"]
@@ -206,9 +195,6 @@ def allowed_settings(settings: EvaluationSettings, server: str | None = None) ->
 
     Args:
         server: address of the policy's server, in place of the card's.
-
-    Raises:
-        MemobenchError: a card may not hold one of them.
     """
     if not all(OBSERVATION.fullmatch(name) for pair in settings.rename_map.items() for name in pair):
         raise _refused("rename_map", settings.rename_map, "expected names of observations")

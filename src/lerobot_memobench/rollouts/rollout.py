@@ -96,10 +96,9 @@ def plans_chunks(policy: Any) -> bool:
 
 
 class Actor:
-    """A policy between its processors.
+    """A policy of LeRobot's interface between its processors.
 
     Args:
-        policy: of LeRobot's interface.
         before: processors of observations: the environment's, then the policy's.
         after: processors of actions: the policy's, then the environment's.
     """
@@ -202,11 +201,7 @@ class Inputs:
 
 
 class BatchSeeds:
-    """Seed the generators of a batch: Python's, NumPy's, torch's and the policy's own.
-
-    Args:
-        seed: of the run.
-    """
+    """Seed the generators of a batch by the seed of the run: Python's, NumPy's, torch's and the policy's own."""
 
     def __init__(self, policy: Any, seed: int) -> None:
         self._policy, self._seed = policy, seed

@@ -114,11 +114,7 @@ def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
 
 
 def typed_settings(nested: Mapping[str, Any]) -> EvaluationSettings:
-    """Return settings for LeRobot's names, nested.
-
-    Raises:
-        MemobenchError: an evaluation of the benchmark has no such setting, or a value has another type.
-    """
+    """Return settings for LeRobot's names, nested; raise for unknown names, and values of another type."""
     known = field_types(EvalPipelineConfig)
     env, policy, loop = (_section(name, nested.get(name)) for name in ("env", "policy", "eval"))
     top_level = {name: value for name, value in nested.items() if name not in ("env", "policy", "eval")}
@@ -148,11 +144,7 @@ def _without_setting(key: str) -> MemobenchError:
 
 
 def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with ``suite`` and ``tasks`` instead of LeRobot's ``task`` and ``task_ids``.
-
-    Raises:
-        MemobenchError: they contradict each other, or name several suites.
-    """
+    """Return settings with ``suite`` and ``tasks`` instead of LeRobot's ``task`` and ``task_ids``, of one suite."""
     names = ("task", "task_ids")
     if not {*names} & {*env}:
         return {**env}

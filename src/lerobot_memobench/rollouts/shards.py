@@ -137,11 +137,7 @@ class ShardJob:
 
 
 def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> list[ShardJob]:
-    """Return a job for each part of an evaluation.
-
-    Args:
-        program: see `ShardJob`.
-        note: called with notes.
+    """Return a job for each part of an evaluation, which starts ``program``.
 
     Raises:
         MemobenchError: there are more parts than batches, or the folders hold another evaluation.
@@ -191,11 +187,7 @@ def part_folders(out: Path) -> list[Path]:
 
 
 def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
-    """Merge parts into the folder ``out`` and report the whole; see `merge`.
-
-    Raises:
-        MemobenchError: see `merge`; or another run writes to ``out``.
-    """
+    """Lock the folder ``out``, merge parts into it and report the whole; see `merge`."""
     with locked_folder(out):
         return _merge_and_report(out, folders)
 
@@ -236,11 +228,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the episodes of all parts, sorted, each once.
-
-    Raises:
-        MemobenchError: two parts disagree about an episode.
-    """
+    """Return the episodes of all parts, sorted, each once; raise where two parts disagree about one."""
     episodes: dict[Key, tuple[Path, Mapping[str, Any]]] = {}
     for folder, records in parts.items():
         for record in records:
