@@ -105,7 +105,6 @@ def supported_versions() -> dict[str, SpecifierSet]:
 
 
 def _installed(name: str) -> str | None:
-    """Return the version of a package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:

@@ -194,7 +194,7 @@ def private_folder(shared: str) -> Path:
 
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; cached per process until the file changes."""
-    status = os.stat(path)
+    status = os.stat(path)  # a changed file has another size, time or inode
     return _hash_of(str(path), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 

@@ -110,7 +110,7 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
 
 
 def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
-    for package in PACKAGES[:3]:
+    for package in PACKAGES[:3]:  # this one, LeRobot and MuJoCo
         versions = {start["versions"].get(package) for start in run.card["runs"]}
         if len(versions) > 1:
             raise MemobenchError(

@@ -130,7 +130,6 @@ class Evaluation:
 
     Attributes:
         place: folder, as messages name it.
-        card: content of its ``evaluation.json``.
         records: its episodes, see `episode_log.joined`.
     """
 
@@ -184,7 +183,7 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
         write_evaluation(target, {**evaluation.card, **block})
         packed = io.BytesIO()
-        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
+        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:  # equal logs, equal files
             file.write(log_text(evaluation.records).encode())
         write_file(target / LOG, packed.getvalue())
     return folder

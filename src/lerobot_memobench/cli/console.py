@@ -144,6 +144,7 @@ FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
 
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
     """Run the commands of an app as `run_command` does."""
+    # In standalone mode click would print errors and end the process.
     call = partial(app, args=list(arguments), standalone_mode=False, prog_name=program)
     return run_command(call, program, again)
 
@@ -161,7 +162,7 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
             result = call()
             sys.stdout.flush()
     except (typer.Abort, KeyboardInterrupt):
-        return 130
+        return 130  # as shells do after Ctrl-C
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:

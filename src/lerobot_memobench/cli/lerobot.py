@@ -109,7 +109,7 @@ def explained(setting: Field[Any]) -> str:
     default = "none" if setting.default is None else str(setting.default)
     plain = default.lower() if isinstance(setting.default, bool) else default
     accepted = f"; {', '.join(values)}" if values else ""
-    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)
+    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)  # 100 with the indent
     return f"  {setting.name}=\n{textwrap.indent(text, ' ' * 8)}\n"
 
 

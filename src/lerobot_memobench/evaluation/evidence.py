@@ -208,6 +208,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
 
 
 def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
+    # The quotient of two equal rates may exceed 1 by rounding.
     return Estimate(float(rate), *interval_of(drawn, wilson(min(float(rate), 1.0), scenes)))
 
 

@@ -141,7 +141,7 @@ def _check_target(out: Path) -> None:
     head = ""
     if (out / PAGE).is_file():
         with (out / PAGE).open(encoding="utf-8", errors="replace") as file:
-            head = file.read(2000)
+            head = file.read(2000)  # the mark is before style and data
     if f'content="{MARK}' not in head:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 

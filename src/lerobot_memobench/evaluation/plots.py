@@ -63,6 +63,7 @@ _DASHES: tuple[Any, ...] = (
 def line_style(number: int, published: bool) -> dict[str, Any]:
     """Return matplotlib's keywords of the line of a method; the paper's have open markers."""
     size = len(_COLOURS)
+    # A method beyond the last colour gets another marker with it.
     colour, other = _COLOURS[number % size], (number + number // size) % size
     face = "white" if published else colour
     return {"color": colour, "marker": _MARKERS[other], "ls": _DASHES[other], "mfc": face, "ms": 4}
@@ -170,7 +171,7 @@ def draw_outcomes(rows: Sequence[Bar]) -> Figure:
 
     steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(rows)]
     heights = list(accumulate(steps, initial=0.0))  # from the top
-    headings = ["", *(bar.heading for bar in rows)]
+    headings = ["", *(bar.heading for bar in rows)]  # that of the previous bar
     with paper_style():
         figure = new_figure(7.0, 1.35 + 0.27 * (heights[-1] + 1))
         axis = figure.subplots()

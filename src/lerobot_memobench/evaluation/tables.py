@@ -320,10 +320,8 @@ PLAIN = Console(width=10_000, markup=False, highlight=False)
 class Unbroken:
     """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
 
-    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge.
-
-    Args:
-        table: not to be changed any more. column: that of the names.
+    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge. ``table`` must
+    not change any more; ``column`` is that of the names.
     """
 
     def __init__(self, table: RichTable, column: int = 0) -> None:

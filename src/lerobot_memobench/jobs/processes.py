@@ -149,7 +149,7 @@ def adding_resume_hint(program: str, how: Callable[[], str]) -> Iterator[None]:
             os.write(2, f"{program}: ended by SIGTERM; {how()}\n".encode())
         finally:
             _kill_descendants()
-            os._exit(128 + number)
+            os._exit(128 + number)  # as shells report a signal
 
     before = signal.getsignal(signal.SIGTERM) if threading.current_thread() is threading.main_thread() else None
     ours = before is signal.SIG_DFL or getattr(before, "__qualname__", None) == end.__qualname__

@@ -120,7 +120,7 @@ def physical_cores() -> int:
 
 def cpu_model() -> str:
     """Return the processor's name."""
-    try:
+    try:  # platform.processor() names no model on Linux
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []

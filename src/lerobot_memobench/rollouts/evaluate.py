@@ -41,7 +41,6 @@ from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, PlannedTask, S
 from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, roll
 
 VIDEOS = "videos"
-"""Folder of the videos, in that of the log."""
 
 Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
@@ -90,7 +89,6 @@ def _summary(plan: EvaluationPlan) -> str:
 
 
 def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note: Note, advance: Advance) -> Run:
-    """Run the batches that are left."""
     ended = False
 
     def begin() -> None:
@@ -121,6 +119,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     """
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
+    # As LeRobot's own command sets them, before it makes the policy.
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(plan.seed)
@@ -303,6 +302,6 @@ def locked_folder(folder: Path) -> Iterator[None]:
             yield
         finally:
             for path in new:
-                for child in [*sorted(path.rglob("*"), reverse=True), path]:
+                for child in [*sorted(path.rglob("*"), reverse=True), path]:  # children first
                     if child.is_dir() and not any(child.iterdir()):
                         child.rmdir()

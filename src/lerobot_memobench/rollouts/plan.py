@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
 """Policies whose actions the environment offers -> the setting by which it does."""
-LARGEST_BATCH = 64
+LARGEST_BATCH = 64  # LeRobot's own limit
 OBJECT_BATCH = 10
 """Environments at once, in one process, of a policy that observes objects and runs on a CPU: a control step of one
 episode took 3.8 ms, against 6.1 ms with one environment."""
@@ -191,6 +191,7 @@ def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTraine
     if settings.output_dir is not None:
         return Path(settings.output_dir) / (options.shard.folder if options.shard is not None else "")
     base = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_memobench_{policy.type}"
+    # Two commands may begin in the same second.
     numbered = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
     return next(folder for folder in itertools.chain([base], numbered) if not folder.exists())
 
@@ -383,7 +384,7 @@ def with_batch_size(
     learned = policy.type not in SCRIPTED and policy.device == "cpu"
     if learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs:
         return replace(settings, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
-    limit = max(1, min(int(cores() * 0.7), most))
+    limit = max(1, min(int(cores() * 0.7), most))  # LeRobot's share of the cores
     return replace(settings, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 

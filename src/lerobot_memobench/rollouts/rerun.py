@@ -44,13 +44,13 @@ from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, m
 from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
 
 MOST_STEPS = 400 * HORIZON
-"""Most control steps of an episode with its pauses and holds."""
+"""Most control steps of an episode with its pauses and holds; those of a strict one may take 180,000."""
 MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
 """Settings of a policy that change more than numbers. All other numbers and truth values are accepted."""
 SERVERS = ("host", "servers")
-WORD = re.compile(r"[\w.,+' ()-]*")
+WORD = re.compile(r"[\w.,+' ()-]*")  # no slash, which paths and names of repositories have
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")

@@ -223,4 +223,5 @@ class BatchSeeds:
 def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
     """Return the seed (32 bits) of the batch of a task whose first episode has the seed ``first``."""
     text = " ".join(str(part) for part in (seed, task, first, *more))
+    # NumPy's legacy generator takes no more than 32 bits.
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")

@@ -59,7 +59,6 @@ class ShardJob:
         program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
         words: the command line of the evaluation after ``lerobot eval``, without folders and run options.
         out: folder of the evaluation.
-        episodes: (task, episode) of the part.
         directory: where relative paths are looked up.
         at_once: parts that run at the same time.
     """
@@ -123,7 +122,7 @@ class ShardJob:
             )
             try:
                 status = process.wait()
-            except BaseException:
+            except BaseException:  # Ctrl-C too
                 process.kill()
                 process.wait()
                 raise
