@@ -67,32 +67,32 @@ def examine() -> list[Finding]:
 
 def system() -> Finding:
     """Check the operating system."""
-    found = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
+    detail = f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"
     if problem := unsupported_system():
-        return Finding("system", "failed", found, problem)
+        return Finding("system", "failed", detail, problem)
     if sys.platform != "linux" or platform.machine() != "x86_64":
-        return Finding("system", "warning", f"{found}; only Linux x86_64 is tested", "packages may be missing or slow")
-    return Finding("system", "ok", found)
+        return Finding("system", "warning", f"{detail}; only Linux x86_64 is tested", "packages may be missing or slow")
+    return Finding("system", "ok", detail)
 
 
 def package_versions() -> Iterator[Finding]:
     """Compare installed versions with the requirements of this project and of LeRobot."""
     requirements = supported_versions()
     for name in SHOWN:
-        found, wanted = _installed(name), requirements.get(name, SpecifierSet())
-        if found is None or not wanted.contains(found, prereleases=True):
-            detail = "not installed" if found is None else f"{found}; supported is {wanted}"
+        installed, wanted = _installed(name), requirements.get(name, SpecifierSet())
+        if installed is None or not wanted.contains(installed, prereleases=True):
+            detail = "not installed" if installed is None else f"{installed}; supported is {wanted}"
             yield Finding(name, "failed", detail, f'pip install "{name}{wanted}"')
-        elif name == "lerobot" and found != RUN_WITH:
-            detail = f"{found}, with which this version was not tested; it was with {RUN_WITH}"
+        elif name == "lerobot" and installed != RUN_WITH:
+            detail = f"{installed}, with which this version was not tested; it was with {RUN_WITH}"
             yield Finding(name, "warning", detail, f'pip install "lerobot=={RUN_WITH}" if a command fails')
         else:
-            yield Finding(name, "ok", found + (f" (supported {wanted})" if str(wanted) else ""))
+            yield Finding(name, "ok", installed + (f" (supported {wanted})" if str(wanted) else ""))
 
 
 def supported_versions() -> dict[str, SpecifierSet]:
     """Return package -> versions that both this project and LeRobot accept on this machine."""
-    found: dict[str, SpecifierSet] = {}
+    supported: dict[str, SpecifierSet] = {}
     lines = [
         line for owner in ("lerobot", DISTRIBUTION) if _installed(owner) for line in metadata.requires(owner) or ()
     ]
@@ -100,12 +100,11 @@ def supported_versions() -> dict[str, SpecifierSet]:
         marker = requirement.marker
         if marker is None or any(marker.evaluate({"extra": extra}) for extra in EXTRAS):
             name = requirement.name.lower().replace("_", "-")
-            found[name] = found.get(name, SpecifierSet()) & requirement.specifier
-    return found
+            supported[name] = supported.get(name, SpecifierSet()) & requirement.specifier
+    return supported
 
 
 def _installed(name: str) -> str | None:
-    """Return the version of a package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -114,11 +113,11 @@ def _installed(name: str) -> str | None:
 
 def physics() -> Finding:
     """Compare MuJoCo with the version of the published figures. From 4.0 a second distribution contains its files."""
-    found = _installed("mujoco") or "not installed"
-    if found.startswith("3.") and (other := _installed("mujoco-core")):
-        fix = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install mujoco=={found}"
-        return Finding("physics", "warning", f"MuJoCo {found} has overwritten the files of {other}", fix)
-    return Finding("physics", "ok", f"MuJoCo {found}; published figures are of {PUBLISHED_MUJOCO}")
+    installed = _installed("mujoco") or "not installed"
+    if installed.startswith("3.") and (other := _installed("mujoco-core")):
+        fix = f"pip uninstall -y mujoco mujoco-core mujoco-studio && pip install mujoco=={installed}"
+        return Finding("physics", "warning", f"MuJoCo {installed} has overwritten the files of {other}", fix)
+    return Finding("physics", "ok", f"MuJoCo {installed}; published figures are of {PUBLISHED_MUJOCO}")
 
 
 def opencv() -> Finding:
@@ -155,20 +154,20 @@ def plugin() -> Finding:
 def caches() -> Finding:
     """Return the folder of caches, which is a temporary one if the home folder cannot be written."""
     folder, own = cache_base(), os.environ.get("NUMBA_CACHE_DIR")
-    found = f"in {folder}" + (f"; numba's in {own}" if own else "")
+    detail = f"in {folder}" + (f"; numba's in {own}" if own else "")
     if folder.is_relative_to(tempfile.gettempdir()):
         fix = "set XDG_CACHE_HOME to a folder that you can write; otherwise each machine or container compiles again"
-        return Finding("caches", "warning", f"{found}, a temporary folder", fix)
-    return Finding("caches", "ok", found)
+        return Finding("caches", "warning", f"{detail}, a temporary folder", fix)
+    return Finding("caches", "ok", detail)
 
 
 def assets() -> Finding:
     """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
-    found = places()
-    if (place := usable(found)) is None:
-        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(found)}", OBTAIN)
-    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused(found)}"
-    if found[0].fault and found[0].source == ASSETS_VARIABLE:
+    candidates = places()
+    if (place := usable(candidates)) is None:
+        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(candidates)}", OBTAIN)
+    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused(candidates)}"
+    if candidates[0].fault and candidates[0].source == ASSETS_VARIABLE:
         return Finding("assets", "warning", detail, f"correct or unset {ASSETS_VARIABLE}")
     return Finding("assets", "ok", detail)
 

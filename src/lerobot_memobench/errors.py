@@ -48,14 +48,14 @@ HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}
 """Word of a paper -> the hint in place of near words."""
 
 
-def nearest(given: str, known: Iterable[str], count: int = 3) -> str:
-    """Return a hint that names the known words nearest to ``given``, or all of them if there are few."""
-    if given.rpartition(".")[2] in HINTS:
-        return HINTS[given.rpartition(".")[2]]
+def nearest(unknown: str, known: Iterable[str], count: int = 3) -> str:
+    """Return a hint that names the known words nearest to ``unknown``, or all of them if there are few."""
+    if unknown.rpartition(".")[2] in HINTS:
+        return HINTS[unknown.rpartition(".")[2]]
     words = sorted(known)
     if not words:
         return "there is none"
-    likeness = {word: difflib.SequenceMatcher(None, word, given).ratio() for word in words}
+    likeness = {word: difflib.SequenceMatcher(None, word, unknown).ratio() for word in words}
     least = max(0.4, 3 * max(likeness.values()) - 2)  # a word that is much nearer is the only one
     close = sorted((word for word in words if likeness[word] >= least), key=lambda word: -likeness[word])[:count]
     if close:

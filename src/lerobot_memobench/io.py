@@ -118,19 +118,19 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
                 f"{error.filename} cannot be read ({error.strerror}); change its permissions"
             ) from None
 
-    found: list[Path] = []
+    files: list[Path] = []
     seen: set[tuple[int, int]] = set()
-    for place, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
-        there = os.stat(place)
-        if (there.st_dev, there.st_ino) in seen:
+    for directory, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
+        status = os.stat(directory)
+        if (status.st_dev, status.st_ino) in seen:
             folders.clear()
             continue
-        seen.add((there.st_dev, there.st_ino))
+        seen.add((status.st_dev, status.st_ino))
         folders.sort()
-        found += [Path(place, name) for name in names if not endings or name.lower().endswith(endings)]
-    for path in found:
+        files += [Path(directory, name) for name in names if not endings or name.lower().endswith(endings)]
+    for path in files:
         check_regular(path)
-    return sorted(found)
+    return sorted(files)
 
 
 def existing_spelling(path: Path) -> Path:
@@ -186,16 +186,16 @@ def private_folder(shared: str) -> Path:
     """
     folder = Path(shared) / f"memobench-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         raise PermissionError(errno.EPERM, "others may write to this folder", str(folder))
     return folder
 
 
 def file_hash(path: Path) -> str:
     """Return the sha256 (hex) of a file; cached per process until the file changes."""
-    found = os.stat(path)
-    return _hash_of(str(path), found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+    status = os.stat(path)  # a changed file has another size, time or inode
+    return _hash_of(str(path), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -210,9 +210,9 @@ def disk_refusal(error: BaseException) -> str | None:
         number = getattr(current, "errno", None)
         if number in (*FULL, *CLOSED):
             return os.strerror(number)
-        found = _IN_WORDS.search(str(current))
-        if found and not isinstance(current, MemobenchError):
-            return found[0]
+        match = _IN_WORDS.search(str(current))
+        if match and not isinstance(current, MemobenchError):
+            return match[0]
     return None
 
 
@@ -228,8 +228,8 @@ def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
         raise
     except Exception as error:  # OSError, or an error of a library in C
         refusal, end = disk_refusal(error), kept and f"; {kept}"
-        named = getattr(error, "filename", None)
-        if refusal is None or (named is not None and not _is_of(Path(os.fsdecode(named)), out)):
+        filename = getattr(error, "filename", None)
+        if refusal is None or (filename is not None and not _is_of(Path(os.fsdecode(filename)), out)):
             raise
         if _output_refuses():
             raise MemobenchError(
@@ -422,10 +422,10 @@ def checked(value: Any, schema: Any) -> Any:
     from pydantic import BaseModel, ValidationError
 
     try:
-        found = _adapter(schema).validate_python(value, strict=True)
+        validated = _adapter(schema).validate_python(value, strict=True)
     except ValidationError as error:
         raise Malformed(first_fault(error.errors(include_url=False), value)) from None
-    return found if isinstance(found, BaseModel) else value
+    return validated if isinstance(validated, BaseModel) else value
 
 
 @contextlib.contextmanager
@@ -459,17 +459,17 @@ def _adapter(schema: Any) -> TypeAdapter[Any]:
 
 def first_fault(errors: Iterable[ErrorDetails], value: Any) -> str:
     """Return a message for the first error; errors of one place are alternatives of a union."""
-    first, *others = [(*_place(error["loc"], value), error) for error in errors]
-    place, found, error = first
+    first, *rest = [(*_place(error["loc"], value), error) for error in errors]
+    place, faulty, error = first
     if error["type"] == "missing":
         missing = dict.fromkeys(
-            str(e["loc"][-1]) for p, _, e in (first, *others) if e["type"] == "missing" and p == place
+            str(e["loc"][-1]) for p, _, e in (first, *rest) if e["type"] == "missing" and p == place
         )
         return f"found no {', '.join(missing)}" + (f" in {place}" if place else "")
-    start = f"found {f'{place} = ' if place else ''}{short(found)}"
+    start = f"found {f'{place} = ' if place else ''}{short(faulty)}"
     if error["type"] in ("value_error", "assertion_error"):  # an error of a validator
         return f"{start}: {error['ctx']['error']}"
-    alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *others) if p == place)
+    alternatives = dict.fromkeys(_expected(e) for p, _, e in (first, *rest) if p == place)
     return f"{start}, expected {' or '.join(alternatives)}"
 
 

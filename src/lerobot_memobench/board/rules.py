@@ -40,14 +40,11 @@ REQUIRED = {
 
 
 def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") -> None:
-    """Check an evaluation: settings, episodes, seeds, versions.
+    """Check an evaluation: settings, episodes, seeds, versions. The error names the first rule that it breaks.
 
     Args:
         part: whether any tasks of the suite, and any number of their episodes, are enough.
         control: name of the control that it is, of `CONTROL_SETTING`.
-
-    Raises:
-        MemobenchError: naming the first rule that it breaks.
     """
     _check_settings(run, **CONTROL_SETTING.get(control, {}))
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
@@ -57,15 +54,11 @@ def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") 
 
 
 def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool = False) -> None:
-    """Check an evaluation of the same policy under a control, as `check_evaluation` does.
-
-    Raises:
-        MemobenchError: it breaks a rule, or has another policy or other settings.
-    """
+    """Check an evaluation under a control as `check_evaluation` does, and that policy and settings are the same."""
     check_evaluation(control, part=part, control=name)
     for key in ("type", "sha256", "settings"):
-        mine, other = (each.card[POLICY].get(key) for each in (run, control))
-        if mine != other:
+        of_run, of_control = (evaluation.card[POLICY].get(key) for evaluation in (run, control))
+        if of_run != of_control:
             raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
     if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
         raise MemobenchError(f"{run.place} and {control.place} differ in {unlike[0]}; evaluate with the same settings")
@@ -106,10 +99,10 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
             f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
             f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
         )
-    asked = set(itertools.product(names, range(count)))
-    there = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
-    for task, episode in sorted(asked ^ there)[:1]:
-        problem = "is missing in the log" if (task, episode) in asked else "is not part of the protocol"
+    requested = set(itertools.product(names, range(count)))
+    logged = {(record["task"], record["episode"]) for record in run.records if "not_run" not in record}
+    for task, episode in sorted(requested ^ logged)[:1]:
+        problem = "is missing in the log" if (task, episode) in requested else "is not part of the protocol"
         raise MemobenchError(
             f"{run.place}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
             f"{len(names)} tasks"
@@ -117,7 +110,7 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
 
 
 def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
-    for package in PACKAGES[:3]:
+    for package in PACKAGES[:3]:  # this one, LeRobot and MuJoCo
         versions = {start["versions"].get(package) for start in run.card["runs"]}
         if len(versions) > 1:
             raise MemobenchError(
@@ -134,10 +127,10 @@ def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
                     f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
                 )
     for name in names:
-        here, there = task_hash(get_task(name)), run.card["task_files"].get(name)
-        if here != there:
+        here, stored = task_hash(get_task(name)), run.card["task_files"].get(name)
+        if here != stored:
             raise MemobenchError(
-                f"{run.place}: the files of {name} have the hash {str(there)[:16]} on the card and {here} in this "
+                f"{run.place}: the files of {name} have the hash {str(stored)[:16]} on the card and {here} in this "
                 "version; evaluate with this version"
             )
 

@@ -105,10 +105,8 @@ class About(BaseModel):
     Attributes:
         model: name of the policy, as the board shows it.
         submitter: person or team; ``@name`` for a GitHub account.
-        date: of the submission.
         training_data: origin and size of the demonstrations.
         parameters: number of parameters; None if unknown, 0 for a scripted policy.
-        links: addresses of code, weights and paper.
         without_memory: row of the board with a policy of the same kind that has no memory.
     """
 
@@ -132,7 +130,6 @@ class Evaluation:
 
     Attributes:
         place: folder, as messages name it.
-        card: content of its ``evaluation.json``.
         records: its episodes, see `episode_log.joined`.
     """
 
@@ -143,8 +140,8 @@ class Evaluation:
     @property
     def protocol(self) -> dict[str, Any]:
         """The protocol of the card."""
-        found: dict[str, Any] = self.card["protocol"]
-        return found
+        protocol: dict[str, Any] = self.card["protocol"]
+        return protocol
 
     @property
     def run(self) -> Run:
@@ -181,14 +178,14 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
     for control in {*CONTROLS} - {*evaluations}:
         shutil.rmtree(folder / control, ignore_errors=True)
     for control, source in evaluations.items():
-        place = folder / control
+        target = folder / control
         evaluation = own_evaluation(source)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
-        write_evaluation(place, {**evaluation.card, **block})
+        write_evaluation(target, {**evaluation.card, **block})
         packed = io.BytesIO()
-        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:
+        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:  # equal logs, equal files
             file.write(log_text(evaluation.records).encode())
-        write_file(place / LOG, packed.getvalue())
+        write_file(target / LOG, packed.getvalue())
     return folder
 
 
@@ -203,11 +200,7 @@ PROMISES = (
 
 
 def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
-    """Return the text in Markdown: files, statements of the submitter, promises to confirm, report of the evaluation.
-
-    Args:
-        name: of the row's folder.
-    """
+    """Return the text in Markdown: files, statements of the submitter, promises to confirm, the evaluation's report."""
     stated = about.model_dump(exclude_none=True)
     stated |= stated.pop("links")
     lines = [

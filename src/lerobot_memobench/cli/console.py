@@ -58,10 +58,10 @@ def console() -> Console:
 
 def table(*columns: str, right: Collection[str] = (), **settings: Any) -> Table:
     """Return a table without rows; columns of numbers are set flush ``right``."""
-    found = Table(header_style="bold", pad_edge=False, title_justify="left", **settings)
+    result = Table(header_style="bold", pad_edge=False, title_justify="left", **settings)
     for name in columns:
-        found.add_column(name, justify="right" if name in right else "left", overflow="fold")
-    return found
+        result.add_column(name, justify="right" if name in right else "left", overflow="fold")
+    return result
 
 
 def say(text: object) -> None:
@@ -144,6 +144,7 @@ FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
 
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:
     """Run the commands of an app as `run_command` does."""
+    # In standalone mode click would print errors and end the process.
     call = partial(app, args=list(arguments), standalone_mode=False, prog_name=program)
     return run_command(call, program, again)
 
@@ -161,7 +162,7 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
             result = call()
             sys.stdout.flush()
     except (typer.Abort, KeyboardInterrupt):
-        return 130
+        return 130  # as shells do after Ctrl-C
     except typer.Exit as stop:
         return stop.exit_code
     except Exception as error:
@@ -182,9 +183,9 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
 def one_sentence(error: BaseException) -> str | None:
     """Return the message for the user in one line, or None for a failure that needs its traceback."""
     errors = list(chain(error))
-    for found in errors:
-        if isinstance(found, MemobenchError):
-            return _line(found)
+    for cause in errors:
+        if isinstance(cause, MemobenchError):
+            return _line(cause)
     from draccus.utils import ParsingError
 
     if isinstance(error, ParsingError):
@@ -196,10 +197,10 @@ def one_sentence(error: BaseException) -> str | None:
     if refusal := lock_refusal(error):
         return refusal
     if refusal := disk_refusal(error):
-        named = next((found.filename for found in errors if isinstance(found, OSError) and found.filename), None)
-        where = f"{os.fsdecode(named)} " if isinstance(named, str | bytes) else ""
+        filename = next((cause.filename for cause in errors if isinstance(cause, OSError) and cause.filename), None)
+        where = f"{os.fsdecode(filename)} " if isinstance(filename, str | bytes) else ""
         return f"{where}cannot be written ({refusal}): make room, or name another folder"
-    fetched = next((found for found in errors if isinstance(found, FETCHING)), None)
+    fetched = next((cause for cause in errors if isinstance(cause, FETCHING)), None)
     if fetched is not None and came_through(fetched, "torch.hub"):
         return (
             f"the pretrained weights of a backbone are not on this machine and could not be fetched "
@@ -209,11 +210,11 @@ def one_sentence(error: BaseException) -> str | None:
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 
     of_hub = (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.TransportError)
-    hub = next((found for found in errors if isinstance(found, of_hub)), None)
+    hub = next((cause for cause in errors if isinstance(cause, of_hub)), None)
     if hub is None:
         return None
     reason = f"{_address(errors)}{_line(hub)[:200]}"
-    if any(came_through(found, "lerobot.datasets.") for found in errors):
+    if any(came_through(cause, "lerobot.datasets.") for cause in errors):
         return (
             f"the dataset is not on this machine and could not be fetched from the hub ({reason}); name a folder on "
             "this machine, dataset=<folder>, or make one: `memobench generate --tasks object --episodes 5 --out "

@@ -62,7 +62,7 @@ def generate(
             f"--suite {suite}: LIBERO's tasks have no scripted expert, so no demonstrations can be made; its own are "
             "the dataset lerobot/libero"
         )
-    named: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
+    options: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generate import episodes_of
     from lerobot_memobench.datasets.generate import generate as run
@@ -91,7 +91,7 @@ def generate(
             finish=finish,
             progress=advance,
             notify=partial(screen.print, soft_wrap=True),
-            **named,
+            **options,
         )
     rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
     for name in summary.tasks:
@@ -176,14 +176,14 @@ def cache(
 
     check_device(device)
     with quiet():
-        given: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
+        options: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
         config = MemobenchMemConfig(
             size=size,
             perception=perception,
             detector=detector,
             visual_encoder=visual_encoder,
             device=device,
-            **given,
+            **options,
         )
     screen = console()
     with counting(screen, "episodes") as count:
@@ -246,7 +246,7 @@ def validate(
     for result in results:
         if result.note is not None:
             say(f"note: {result.subject}: {result.note}")
-    episodes, files = ([each.disagreement for each in results if each.of_file == of_file] for of_file in (False, True))
+    episodes, files = ([r.disagreement for r in results if r.of_file == of_file] for of_file in (False, True))
     damaged = ", and files of the dataset do not (above)" if any(files) else ""
     say(f"{episodes.count(None)} of {len(episodes)} episodes agree{damaged}")
     return 1 if any(episodes) or any(files) else 0

@@ -109,7 +109,7 @@ def explained(setting: Field[Any]) -> str:
     default = "none" if setting.default is None else str(setting.default)
     plain = default.lower() if isinstance(setting.default, bool) else default
     accepted = f"; {', '.join(values)}" if values else ""
-    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)
+    text = textwrap.fill(f"{meaning}{accepted} (default: {usual or plain})", 92)  # 100 with the indent
     return f"  {setting.name}=\n{textwrap.indent(text, ' ' * 8)}\n"
 
 
@@ -139,14 +139,14 @@ def evaluate_suites(suites: Sequence[str], words: Mapping[str, str]) -> int:
     from lerobot_memobench.evaluation.report import memory_types_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
-    named = words.get("output_dir")
-    if named is None and "resume" not in words:
-        named = f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
+    output = words.get("output_dir")
+    if output is None and "resume" not in words:
+        output = f"outputs/eval/{datetime.now():%Y-%m-%d/%H-%M-%S}_memobench"
     status, folders = 0, list[Path]()
     for suite in suites:
-        folder = None if named is None else Path(named) / suite
-        place = {} if folder is None else {"output_dir": str(folder)}
-        status = max(status, evaluate(without(words, "env.task") | {"task": suite} | place))
+        folder = None if output is None else Path(output) / suite
+        output_option = {} if folder is None else {"output_dir": str(folder)}
+        status = max(status, evaluate(without(words, "env.task") | {"task": suite} | output_option))
         folders += [folder] if folder is not None and has_log(folder) else []
     if folders:
         (run,) = read_runs(folders)
@@ -165,8 +165,8 @@ def check_tasks(words: Mapping[str, str]) -> tuple[str, ...]:
         ids = yaml.safe_load(ids or "null")
     suites, tasks = lerobots_choice(task, ids, suite, "all" if tasks is None else tasks)
     if not elsewhere:
-        for each in suites:
-            resolve_tasks(tasks, each)
+        for suite_name in suites:
+            resolve_tasks(tasks, suite_name)
     return suites
 
 
@@ -181,14 +181,14 @@ def flags_of_other(words: Mapping[str, str]) -> list[str]:
     for key in words:
         if key in RUN_OPTIONS:
             raise MemobenchError(f"{key}= belongs to the benchmark: name it with env=memobench")
-    asked = read_words("eval", words)
-    kept = {key: words[key] for key in words if key == CONFIG_FILE or key.endswith(f".{PACKAGES}")}
-    flags = [f"--{word}" for word in as_command_line({**kept, **asked.words})]
+    request = read_words("eval", words)
+    passed_on = {key: words[key] for key in words if key == CONFIG_FILE or key.endswith(f".{PACKAGES}")}
+    flags = [f"--{word}" for word in as_command_line({**passed_on, **request.words})]
     if HELP in words:
         return ["--help", *flags]
-    if asked.get(f"env.{TYPE}") is None and CONFIG_FILE not in words:
+    if request.get(f"env.{TYPE}") is None and CONFIG_FILE not in words:
         raise MemobenchError("name an environment: env=memobench")
-    if (path := asked.get(f"policy.{PATH}")) is not None:
+    if (path := request.get(f"policy.{PATH}")) is not None:
         check_checkpoint(path)
     return flags
 

@@ -64,49 +64,49 @@ def tasks(
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
-    found = [get_task(name) for name in task_names(suite=suite)] if folder is None else list[Task]()
+    listed = [get_task(name) for name in task_names(suite=suite)] if folder is None else list[Task]()
     problems: list[str] = []
-    for place in [] if folder is None else find_tasks(folder):
+    for path in [] if folder is None else find_tasks(folder):
         try:
-            found.append(load_task(place))
+            listed.append(load_task(path))
         except MemobenchError as error:
             problems.append(str(error))
-    if not found:
+    if not listed:
         raise MemobenchError(problems[0])
     if as_json:
         from lerobot_memobench.sim.simulation import Simulation
 
         records = []
-        for task in found:
+        for task in listed:
             try:
                 records.append(task_record(task, Simulation(task).state_dim))  # of the compiled model
             except MemobenchError as error:
                 problems.append(f"{task.folder}: {error}")
         print(json.dumps(records, indent=1))
     else:
-        console().print(Unbroken(task_table(found), column=1), crop=False)
+        console().print(Unbroken(task_table(listed), column=1), crop=False)
     for problem in problems:
         note(f"memobench: {problem}")
     return 1 if problems else 0
 
 
-def task_table(found: Sequence[Task]) -> Table:
+def task_table(tasks: Sequence[Task]) -> Table:
     """Return one row per task; ``tasks=`` and ``--tasks`` take the numbers, a user's own tasks have none.
 
     ``gap``: the longest of the task's checkpoints, control steps.
     """
-    known = [suite_of(task.name) is not None and task.folder == task_folder(task.name) for task in found]
-    suites = {task.suite if own else "" for task, own in zip(found, known, strict=True)}
-    title = count_of(len(found), "task") + (f" of the {min(suites)} suite" if len(suites) == 1 and all(suites) else "")
+    known = [suite_of(task.name) is not None and task.folder == task_folder(task.name) for task in tasks]
+    suites = {task.suite if own else "" for task, own in zip(tasks, known, strict=True)}
+    title = count_of(len(tasks), "task") + (f" of the {min(suites)} suite" if len(suites) == 1 and all(suites) else "")
     if suites <= {*LIBERO_SUITES}:  # without checkpoints and prompts
         rows = table("id", "task", "instruction", right=("id",), title=title)
-        for task in found:
+        for task in tasks:
             rows.add_row(str(task_number(task.name)), task.name, task.language)
         return rows
     columns = ("no.", "task", "memory type", "checkpoints", "gap", "demonstration prompt", "instruction")
     rows = table(*columns, right=("no.", "gap"), title=title)
-    for k, task in enumerate(found):
-        if k and task.memory_type != found[k - 1].memory_type:
+    for k, task in enumerate(tasks):
+        if k and task.memory_type != tasks[k - 1].memory_type:
             rows.add_section()
         prompt = task.prompt.kind if task.prompt else ""
         gap = str(longest_gap(task) or "")
@@ -122,14 +122,14 @@ def objects(
     from lerobot_memobench.sim.object_layout import SLOTS
     from lerobot_memobench.sim.object_slots import layout
 
-    found = layout()
+    description = layout()
     if as_json:
-        print(json.dumps(found, indent=1))
+        print(json.dumps(description, indent=1))
         return
     say(f"{SLOTS} slots, one after another; of each:")
-    for field in found["fields"]:
+    for field in description["fields"]:
         say(f"  {field['start']:>2}  {field['name']} ({field['size']})")
-    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(found["classes"])))
+    say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(description["classes"])))
 
 
 def doctor(
@@ -152,10 +152,10 @@ def finding_table(findings: Sequence[Finding]) -> Table:
     """Return one row per finding, with the fix below the problem."""
     rows = table("checked", "", "found")
     for finding in findings:
-        found = Text(finding.detail)
+        detail = Text(finding.detail)
         if finding.fix:
-            found.append("\nfix: ", "bold").append(finding.fix)
-        rows.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), found)
+            detail.append("\nfix: ", "bold").append(finding.fix)
+        rows.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), detail)
     return rows
 
 

@@ -59,8 +59,8 @@ def report(
 
     runs = read_runs(folders)
     for run in runs:
-        for each in run.evaluations:
-            _write_next_to_log(each)
+        for evaluation in run.evaluations:
+            _write_next_to_log(evaluation)
     show_report(evaluation_report(runs), "report", format_, out)
     if figures is not None:
         from lerobot_memobench.evaluation.plots import draw_figures
@@ -113,8 +113,8 @@ def compare(
     from lerobot_memobench.evaluation.records import read_runs
 
     first, second = read_runs([a, b])
-    found = compare_evaluations(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    show_report(comparison_report(found), "compare", format_, out, comparison_csv(found))
+    comparison = compare_evaluations(first, second, allow=allow or (), seed=seed, permutations=permutations)
+    show_report(comparison_report(comparison), "compare", format_, out, comparison_csv(comparison))
 
 
 def merge(
@@ -184,8 +184,8 @@ def submit(
         write_submission,
     )
 
-    given = {"--name": name, "--model": model, "--submitter": submitter, "--training-data": training_data}
-    if missing := [option for option, text in given.items() if not (text or check)]:
+    required = {"--name": name, "--model": model, "--submitter": submitter, "--training-data": training_data}
+    if missing := [option for option, text in required.items() if not (text or check)]:
         raise MemobenchError(f"a submission needs {', '.join(missing)}; to check a result alone, give --check")
     if check:
         name, model, submitter, training_data = (text or "unnamed" for text in (name, model, submitter, training_data))
@@ -242,12 +242,12 @@ def show_report(
         if out.exists() and not out.is_dir():
             raise MemobenchError(f"--out {out} is a file; name a folder")
         out.mkdir(parents=True, exist_ok=True)
-    for each in dict.fromkeys(formats or ["table"]):
-        if out is None and each == "table":
+    for format_ in dict.fromkeys(formats or ["table"]):
+        if out is None and format_ == "table":
             console().print(terminal(report), crop=False)
             continue
-        if each != "csv":
-            texts = {f"{name}.{ENDINGS[each]}": WRITERS[each](report)}
+        if format_ != "csv":
+            texts = {f"{name}.{ENDINGS[format_]}": WRITERS[format_](report)}
         elif as_csv is None:
             texts = {f"tables/{key}.csv": text for key, text in csv_tables(report).items()}
         else:

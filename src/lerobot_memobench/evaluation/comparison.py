@@ -83,7 +83,7 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
                 f"found --allow {name!r}, expected a setting of the protocol, {nearest(name, ALLOWED)}"
             )
     unlike = differences(a.protocol, b.protocol, ignore={*OF_ONE_EVALUATION, *allow})
-    names = [each.split(":")[0] for each in unlike]
+    names = [difference.split(":")[0] for difference in unlike]
     pairs = _common_episodes(a, b)
     unlike_episodes = _unlike_episodes(pairs, {*allow, *names})
     if unlike or unlike_episodes:
@@ -105,18 +105,18 @@ def _common_episodes(a: Run, b: Run) -> list[Pair]:
     def key(record: Record) -> tuple[str, int, int | None]:
         return record["task"], record["episode"], record.get("variant") if redrawn else None
 
-    others = {key(record): record for record in b.records}
-    pairs = [(record, others[key(record)]) for record in a.records if key(record) in others]
+    records_b = {key(record): record for record in b.records}
+    pairs = [(record, records_b[key(record)]) for record in a.records if key(record) in records_b]
     if not pairs:
         raise MemobenchError(
             f"{a.folder} and {b.folder} have no episode in common; expected evaluations of the same tasks, episodes "
             "and referent"
         )
-    for mine, other in pairs:
-        if operations(mine) != operations(other):
+    for first, second in pairs:
+        if operations(first) != operations(second):
             raise MemobenchError(
-                f"{mine['task']!r} has other checkpoints in {a.folder} ({operations(mine)}) than in {b.folder} "
-                f"({operations(other)}); compare evaluations of one version of the task"
+                f"{first['task']!r} has other checkpoints in {a.folder} ({operations(first)}) than in {b.folder} "
+                f"({operations(second)}); compare evaluations of one version of the task"
             )
     return pairs
 
@@ -277,11 +277,11 @@ class _Task(NamedTuple):
 
 
 def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
-    partners = {id(mine): other for mine, other in pairs}
+    partners = {id(first): second for first, second in pairs}
     rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
     tasks = []
-    for name, group in by_task(mine for mine, _ in pairs).items():
-        both = [(mine, partners[id(mine)]) for mine in group]
+    for name, group in by_task(first for first, _ in pairs).items():
+        both = [(record, partners[id(record)]) for record in group]
         values = {
             metric: np.array([[rollout_value(r, metric) for r in pair] for pair in both], float) for metric in METRICS
         }
@@ -341,7 +341,7 @@ def _contrasts(
             if applicable := [group for group in samples if group]:
                 contrasts.append(_contrast((kind, scope), metric, applicable, rng, permutations, closes))
     for metric in METRICS:
-        of_tasks = [k for k, each in enumerate(contrasts) if each.metric == metric and each.kind == "task"]
+        of_tasks = [k for k, contrast in enumerate(contrasts) if contrast.metric == metric and contrast.kind == "task"]
         for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
             contrasts[k] = replace(contrasts[k], adjusted=p)
     return contrasts
@@ -423,13 +423,9 @@ def comparison_report(comparison: Comparison) -> Report:
 
 
 def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
-    """Return the tables of a comparison, with a title.
-
-    Args:
-        overall: the average and memory types alone.
-    """
-    kinds = {each.kind for each in comparison.contrasts}
-    tables = [_table(comparison, *each) for each in TABLES[: 1 if overall else None] if kinds & {*each[2]}]
+    """Return the tables of a comparison, with a title; ``overall`` leaves tasks and families out."""
+    kinds = {contrast.kind for contrast in comparison.contrasts}
+    tables = [_table(comparison, *spec) for spec in TABLES[: 1 if overall else None] if kinds & {*spec[2]}]
     if MEMORY_TYPE not in kinds:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
     sentence = f"{count_of(comparison.pairs, 'episode')} in both, paired by task, episode and referent."
@@ -438,11 +434,7 @@ def comparison_section(comparison: Comparison, overall: bool = False) -> Section
 
 
 def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
-    """Return a comparison as JSON values.
-
-    Args:
-        overall: the average and memory types alone.
-    """
+    """Return a comparison as JSON values; ``overall`` leaves tasks and families out."""
     kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
     return {
         "a": comparison.runs[0].name,

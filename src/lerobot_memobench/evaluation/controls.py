@@ -133,10 +133,10 @@ def control_between(a: Run, b: Run) -> Control | None:
                 f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
             )
         for key in ("type", "sha256") if control.one_policy else ():
-            mine, other = (run.protocol[POLICY].get(key) for run in (a, b))
-            if mine and other and mine != other:
+            of_a, of_b = (run.protocol[POLICY].get(key) for run in (a, b))
+            if of_a and of_b and of_a != of_b:
                 raise MemobenchError(
-                    f"{a.folder} and {b.folder} are of two policies ({key} {str(mine)[:12]} and {str(other)[:12]}); "
+                    f"{a.folder} and {b.folder} are of two policies ({key} {str(of_a)[:12]} and {str(of_b)[:12]}); "
                     "expected one policy with and without the control"
                 )
         return control

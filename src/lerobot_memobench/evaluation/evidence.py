@@ -171,10 +171,10 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
         return {}, {}
     variants = [task.variant(k) for k in task.random_variants]
     first: dict[Any, int] = {}
-    for one in variants:
-        first.setdefault((one.language, one.goal), one.variant_index)
-    instructions = {one.variant_index: one.language for one in variants}
-    return instructions, {one.variant_index: first[one.language, one.goal] for one in variants}
+    for variant in variants:
+        first.setdefault((variant.language, variant.goal), variant.variant_index)
+    instructions = {variant.variant_index: variant.language for variant in variants}
+    return instructions, {variant.variant_index: first[variant.language, variant.goal] for variant in variants}
 
 
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
@@ -208,6 +208,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
 
 
 def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
+    # The quotient of two equal rates may exceed 1 by rounding.
     return Estimate(float(rate), *interval_of(drawn, wilson(min(float(rate), 1.0), scenes)))
 
 
@@ -217,8 +218,8 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 def evidence_section(evidence: EvidenceRates) -> Section:
     """Return the tables of an evaluation in which each scene was run with each variant."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
-    rows = [_row(name, each) for name, each in evidence.memory_types.items()]
-    of_tasks = [_row(Name(name), each) for name, each in evidence.tasks.items()]
+    rows = [_row(name, rates) for name, rates in evidence.memory_types.items()]
+    of_tasks = [_row(Name(name), rates) for name, rates in evidence.tasks.items()]
     tables = [Table("evidence_tasks", "", ("task", *header), of_tasks)]
     if evidence.average is not None:
         rows.append(_row("average", evidence.average))
@@ -228,7 +229,7 @@ def evidence_section(evidence: EvidenceRates) -> Section:
 
 def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:
     rates = [evidence.rates.get(name) for name in SHOWN]
-    cells = [None if each is None else Numbers(with_interval(each.value, each.low, each.high)) for each in rates]
+    cells = [None if rate is None else Numbers(with_interval(rate.value, rate.low, rate.high)) for rate in rates]
     return (name, evidence.scenes, Numbers(percent_text(evidence.chance)), *cells, Numbers(f"{evidence.p:.2g}"))
 
 
@@ -237,8 +238,8 @@ def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[st
     groups = _by_task(records)
     return {
         "average": None if evidence.average is None else _data(evidence.average),
-        "tasks": {name: {**_data(each), "choices": _choices(groups[name])} for name, each in evidence.tasks.items()},
-        "memory_types": {name: _data(each) for name, each in evidence.memory_types.items()},
+        "tasks": {name: {**_data(rates), "choices": _choices(groups[name])} for name, rates in evidence.tasks.items()},
+        "memory_types": {name: _data(rates) for name, rates in evidence.memory_types.items()},
     }
 
 

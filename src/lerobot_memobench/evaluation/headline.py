@@ -91,5 +91,5 @@ def inputs_of(run: Run) -> str:
     inputs, prompt_in = f"inputs: {inputs_phrase(run.records)}", run.protocol.get("prompt_in")
     if run.protocol.get("demonstration_prompt") is False:
         return f"{inputs}, no demonstration prompt"
-    prompted = any(each.get("prompt_steps") and each.get("prompt_shown", True) is not None for each in run.records)
+    prompted = any(r.get("prompt_steps") and r.get("prompt_shown", True) is not None for r in run.records)
     return f"{inputs}, {PROMPT_IN[prompt_in]}" if prompted and prompt_in in PROMPT_IN else inputs

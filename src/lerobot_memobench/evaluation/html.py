@@ -93,15 +93,15 @@ def write_html(folders: Sequence[str | Path], out: str | Path, task_dir: str | P
     evaluations = read_runs(folders)
     for run, slug in zip(evaluations, _slugs([run.name for run in evaluations]), strict=True):
         names, chunks, notes, first = dict[int, str](), dict[int, list[Chunk]](), list[str](), 0
-        for each in run.evaluations:
-            own_videos, misfits = find_videos(each.folder, each.records)
-            own_reads, others = find_reads(each.folder, each.records, each.protocol)
+        for evaluation in run.evaluations:
+            own_videos, video_notes = find_videos(evaluation.folder, evaluation.records)
+            own_reads, read_notes = find_reads(evaluation.folder, evaluation.records, evaluation.protocol)
             for k, video in own_videos.items():
-                names[first + k] = f"{VIDEOS}/{slug}/{episode_id(each.records[k])}{VIDEO}"
+                names[first + k] = f"{VIDEOS}/{slug}/{episode_id(evaluation.records[k])}{VIDEO}"
                 chosen[out / names[first + k]] = video
             chunks |= {first + k: read for k, read in own_reads.items()}
-            notes += [*misfits, *others]
-            first += len(each.records)
+            notes += [*video_notes, *read_notes]
+            first += len(evaluation.records)
         addresses.append(names)
         reads.append(chunks)
         runs.append(replace(run, notes=(*run.notes, *notes)))
@@ -128,7 +128,7 @@ def _slugs(names: Sequence[str]) -> list[str]:
     for name in names:
         base = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "run"
         candidates = (base if k == 1 else f"{base}_{k}" for k in itertools.count(1))
-        slug = next(each for each in candidates if each.lower() not in slugs)
+        slug = next(candidate for candidate in candidates if candidate.lower() not in slugs)
         slugs[slug.lower()] = slug
     return [*slugs.values()]
 
@@ -141,7 +141,7 @@ def _check_target(out: Path) -> None:
     head = ""
     if (out / PAGE).is_file():
         with (out / PAGE).open(encoding="utf-8", errors="replace") as file:
-            head = file.read(2000)
+            head = file.read(2000)  # the mark is before style and data
     if f'content="{MARK}' not in head:
         raise MemobenchError(f"--out {out} holds files that are no earlier report; name a new or an empty folder")
 
@@ -213,9 +213,9 @@ def place_videos(chosen: Mapping[Path, Path]) -> None:
     """
     for target, source in chosen.items():
         if target.exists():
-            here, there = source.stat(), target.stat()
-            copied = (here.st_size, here.st_mtime_ns) == (there.st_size, there.st_mtime_ns)
-            if os.path.samestat(here, there) or copied:
+            source_stat, target_stat = source.stat(), target.stat()
+            copied = (source_stat.st_size, source_stat.st_mtime_ns) == (target_stat.st_size, target_stat.st_mtime_ns)
+            if os.path.samestat(source_stat, target_stat) or copied:
                 continue
         target.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(target) as draft:
@@ -248,8 +248,8 @@ def page_data(
         known: task name -> task, for language and checkpoint texts.
     """
     controls: dict[str, list[str]] = {run.name: [] for run in runs}
-    for each in controls_among(runs):
-        controls[each.runs[1].name].append(comparison_phrase(each))
+    for comparison in controls_among(runs):
+        controls[comparison.runs[1].name].append(comparison_phrase(comparison))
     return {
         "version": __version__,
         "notices": unlike(runs),
@@ -277,7 +277,7 @@ def tasks_data(records: Sequence[Record], known: Mapping[str, Task]) -> dict[str
     result: dict[str, Any] = {}
     for name, (record,) in by_task(last.values()).items():
         task = known.get(name)
-        variants = sorted({int(each.get("variant") or 0) for each in records if each["task"] == name})
+        variants = sorted({int(r.get("variant") or 0) for r in records if r["task"] == name})
         if task is None or task.operations != operations(record):
             variants = []
         result[name] = {
@@ -286,14 +286,15 @@ def tasks_data(records: Sequence[Record], known: Mapping[str, Task]) -> dict[str
             "language": task.title if task else name.replace("_", " "),
             "variants": {
                 str(k): {
-                    "goal": format_formula(one.goal),
+                    "goal": format_formula(variant.goal),
                     "checkpoints": [
-                        {"goal": format_formula(each.goal), "texts": list(each.language)} for each in one.checkpoints
+                        {"goal": format_formula(checkpoint.goal), "texts": list(checkpoint.language)}
+                        for checkpoint in variant.checkpoints
                     ],
                 }
                 for k in variants
                 if task and k < task.num_variants
-                for one in [task.variant(k)]
+                for variant in [task.variant(k)]
             },
         }
     return result
@@ -304,7 +305,7 @@ def evaluation_on_page(
 ) -> dict[str, Any]:
     """Return one evaluation: protocol, rates, failures and rollouts."""
     summary = run.summary
-    starts = [start for each in run.evaluations for start in each.card.get("runs", [])]
+    starts = [start for evaluation in run.evaluations for start in evaluation.card.get("runs", [])]
     return {
         "name": run.name,
         "headline": headline([run]),
@@ -330,9 +331,9 @@ def evaluation_on_page(
 
 def facts(run: Run) -> list[str]:
     """Return the line below the first one: rollouts, their horizon, and how often choices follow the evidence."""
-    horizons = dict.fromkeys(each.protocol.get("horizon") for each in run.evaluations)
+    horizons = dict.fromkeys(evaluation.protocol.get("horizon") for evaluation in run.evaluations)
     evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
-    return [count_of(len(run.records), "rollout"), *(f"horizon {each}" for each in horizons if each), *evidence]
+    return [count_of(len(run.records), "rollout"), *(f"horizon {steps}" for steps in horizons if steps), *evidence]
 
 
 def row_data(row: Row) -> dict[str, Any]:

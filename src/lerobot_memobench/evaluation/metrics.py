@@ -133,8 +133,8 @@ def unsettled(records: Iterable[Record]) -> list[str]:
         scenes = {record.get("seed"): record.get("settled", True) for record in group}
         if thrown := sum(not settled for settled in scenes.values()):
             counts.append(f"{thrown} of {count_of(len(scenes), 'scene')} of {task}")
-    place = "results/unsettled_scenes.md lists those of the paper's seeds"
-    note = f"an object is thrown or still moves before the first action in {', '.join(counts)}; {place}"
+    reference = "results/unsettled_scenes.md lists those of the paper's seeds"
+    note = f"an object is thrown or still moves before the first action in {', '.join(counts)}; {reference}"
     return [note] if counts else []
 
 
@@ -243,7 +243,7 @@ def task_row(records: Sequence[Record]) -> Row:
 def pooled_row(records: Sequence[Record]) -> Row:
     """Return the metrics over all outcomes of all rollouts; n counts outcomes, such as checkpoint records."""
     outcomes = {
-        metric: [each for record in records for each in METRICS[metric].outcomes(record)]
+        metric: [outcome for record in records for outcome in METRICS[metric].outcomes(record)]
         for metric in _metrics(records)
     }
     return {metric: share(values) for metric, values in outcomes.items()}
@@ -300,7 +300,7 @@ def mean_rate(rates: Iterable[Rate]) -> Rate:
     trials = [rate.trials for rate in applicable]
     if 0 in trials:  # rates without rollouts, such as the paper's
         return Rate(mean, n)
-    effective = count * count / sum(1 / each for each in trials)
+    effective = count * count / sum(1 / number for number in trials)
     return Rate(mean, n, None if math.isclose(effective, n) else effective)
 
 
@@ -362,7 +362,6 @@ class TaskSummary:
         operations: labels of the checkpoints, such as "SUU".
         prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any order.
         ordered_prefix: the same in order.
-        failures: class -> number of failed rollouts.
     """
 
     memory_type: str

@@ -63,6 +63,7 @@ _DASHES: tuple[Any, ...] = (
 def line_style(number: int, published: bool) -> dict[str, Any]:
     """Return matplotlib's keywords of the line of a method; the paper's have open markers."""
     size = len(_COLOURS)
+    # A method beyond the last colour gets another marker with it.
     colour, other = _COLOURS[number % size], (number + number // size) % size
     face = "white" if published else colour
     return {"color": colour, "marker": _MARKERS[other], "ls": _DASHES[other], "mfc": face, "ms": 4}
@@ -170,7 +171,7 @@ def draw_outcomes(rows: Sequence[Bar]) -> Figure:
 
     steps = [1.0 if a.heading == b.heading else 1.45 for a, b in pairwise(rows)]
     heights = list(accumulate(steps, initial=0.0))  # from the top
-    headings = ["", *(bar.heading for bar in rows)]
+    headings = ["", *(bar.heading for bar in rows)]  # that of the previous bar
     with paper_style():
         figure = new_figure(7.0, 1.35 + 0.27 * (heights[-1] + 1))
         axis = figure.subplots()
@@ -286,14 +287,13 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
 
 
 def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
-    """Draw the rate of reached checkpoints over their gap, a line per evaluation, with Wilson's intervals.
+    """Draw the rate of reached checkpoints over their gap with Wilson's intervals, a line per evaluation.
 
-    Args:
-        by_gap: name of an evaluation -> its `success_by_gap`.
+    ``by_gap`` maps its name to its `success_by_gap`.
     """
     from matplotlib.lines import Line2D
 
-    groups = [group for group in GAPS if any(group in each for each in by_gap.values())]
+    groups = [group for group in GAPS if any(group in counts for counts in by_gap.values())]
     styles = {name: line_style(number, published=False) for number, name in enumerate(by_gap)}
     with paper_style():
         figure = new_figure(5.0, 2.7)

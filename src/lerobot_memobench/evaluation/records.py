@@ -52,7 +52,7 @@ class Extent(NamedTuple):
         total = len(self.tasks) * len(self.episodes)
         if len(logged) == total:
             return None
-        task, episode = next(each for each in itertools.product(self.tasks, self.episodes) if each not in logged)
+        task, episode = next(key for key in itertools.product(self.tasks, self.episodes) if key not in logged)
         unrun = len(self.tasks) - len({name for name, _ in logged})
         return (
             f"missing: {total - len(logged):,} of {count_of(total, 'episode')}"
@@ -114,7 +114,7 @@ class Run:
     @property
     def suites(self) -> tuple[str, ...]:
         """The suites of its rollouts."""
-        return tuple(each.protocol.get("suite", PUBLISHED) for each in self.evaluations)
+        return tuple(evaluation.protocol.get("suite", PUBLISHED) for evaluation in self.evaluations)
 
     @cached_property
     def summary(self) -> Summary:
@@ -148,11 +148,11 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
         MemobenchError: a folder holds no rollouts or is given twice, one method has two results at one interval, or
             the suites or the sources of the scenes differ.
     """
-    given = [_split(word) for word in words]
-    if not given:
+    labelled = [_split(word) for word in words]
+    if not labelled:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
-    names = folder_names([folder for _, folder in given])
-    runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(given, names, strict=True)]
+    names = folder_names([folder for _, folder in labelled])
+    runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(labelled, names, strict=True)]
     first = runs[0].suites[0]
     for run in runs:
         if (suite := run.suites[0]) != first and not {suite, first} <= {*LIBERO_SUITES}:
@@ -180,26 +180,22 @@ def _with_suites_joined(runs: Sequence[Run]) -> Sequence[Run]:
 
 
 def _joined(parts: Sequence[Run]) -> Run:
-    """Return evaluations of one policy, each in another suite of LIBERO, as one.
-
-    Raises:
-        MemobenchError: they are of several policies, or two are of one suite.
-    """
+    """Return evaluations of one policy, each in another suite of LIBERO, as one; raise for several policies."""
     if len(parts) == 1:
         return parts[0]
     parts = sorted(parts, key=lambda part: GROUPS.index(part.suites[0]))
-    for one, other in pairwise(parts):
-        if one.suites == other.suites or _policy(one) != _policy(other):
-            same = f"the suite {one.suites[0]}" if one.suites == other.suites else "other policies"
+    for a, b in pairwise(parts):
+        if a.suites == b.suites or _policy(a) != _policy(b):
+            same = f"the suite {a.suites[0]}" if a.suites == b.suites else "other policies"
             raise MemobenchError(
-                f"{one.folder} and {other.folder} are of {same}, and an average over suites of LIBERO is of one policy "
+                f"{a.folder} and {b.folder} are of {same}, and an average over suites of LIBERO is of one policy "
                 "and each suite once; give the folders of each policy one name: A=FOLDER A=FOLDER B=FOLDER"
             )
         for name in PICTURES:
-            if one.protocol.get(name) != other.protocol.get(name):
-                raise MemobenchError(f"{one.folder} and {other.folder} differ in {name}; report each by itself")
+            if a.protocol.get(name) != b.protocol.get(name):
+                raise MemobenchError(f"{a.folder} and {b.folder} differ in {name}; report each by itself")
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
-    protocol = {key: each[0] if each.count(each[0]) == len(parts) else each for key, each in values.items()}
+    protocol = {key: group[0] if group.count(group[0]) == len(parts) else group for key, group in values.items()}
     missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
     return replace(
         parts[0],
@@ -232,31 +228,31 @@ def unlike(runs: Sequence[Run]) -> list[str]:
 
 def other_draws(a: Run, b: Run) -> list[str]:
     """Return a sentence where two evaluations of the sealed test have different salts."""
-    mine, other = (run.protocol.get("salt") for run in (a, b))
-    if mine == other:
+    salt_a, salt_b = (run.protocol.get("salt") for run in (a, b))
+    if salt_a == salt_b:
         return []
     return [
-        f"{a.name} has the salt {mine or 'none'} and {b.name} {other or 'none'}: their variants and holds are two "
+        f"{a.name} has the salt {salt_a or 'none'} and {b.name} {salt_b or 'none'}: their variants and holds are two "
         "draws of the same protocol; comparisons pair the episodes of equal variants"
     ]
 
 
 def other_hashes(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
     """Return a sentence where the versions of scene hashes differ between two protocols."""
-    mine, other = (protocol.get(SCENE_HASHES) for protocol in (a, b))
-    if mine == other:
+    of_a, of_b = (protocol.get(SCENE_HASHES) for protocol in (a, b))
+    if of_a == of_b:
         return []
-    return [f"the versions hash scenes differently ({SCENE_HASHES} {mine} and {other}): hashes are not compared"]
+    return [f"the versions hash scenes differently ({SCENE_HASHES} {of_a} and {of_b}): hashes are not compared"]
 
 
 def other_physics(a: Run, b: Run) -> list[str]:
     """Return a sentence where two evaluations ran under different versions of MuJoCo, by their cards."""
     starts = ([start.get("versions", {}) for start in run.card.get("runs", [])] for run in (a, b))
-    mine, other = ({versions["mujoco"] for versions in each if "mujoco" in versions} for each in starts)
-    if not mine or not other or mine == other:
+    versions_a, versions_b = ({versions["mujoco"] for versions in group if "mujoco" in versions} for group in starts)
+    if not versions_a or not versions_b or versions_a == versions_b:
         return []
-    here, there = (" and ".join(sorted(versions)) for versions in (mine, other))
-    return [f"{a.name} ran under MuJoCo {here} and {b.name} under {there}: scenes start and move slightly otherwise"]
+    of_a, of_b = (" and ".join(sorted(versions)) for versions in (versions_a, versions_b))
+    return [f"{a.name} ran under MuJoCo {of_a} and {b.name} under {of_b}: scenes start and move slightly otherwise"]
 
 
 def read_run(folder: str | Path, name: str | None = None, method: str = "") -> Run:
@@ -323,9 +319,9 @@ def _with_methods(runs: Sequence[Run]) -> list[Run]:
     # Where policies are unknown, or one has several results at the same interval, folders name the methods.
     results = Counter((method, run.replan_steps) for run, method in zip(runs, methods, strict=True))
     repeated = {method for (method, _), count in results.items() if count > 1}
-    if given := {run.method for run in runs if run.method} & repeated:
+    if ambiguous := {run.method for run in runs if run.method} & repeated:
         raise MemobenchError(
-            f"two evaluations named {min(given)!r} have the same replan interval; give them names of their own"
+            f"two evaluations named {min(ambiguous)!r} have the same replan interval; give them names of their own"
         )
     methods = [run.name if method in repeated else method for run, method in zip(runs, methods, strict=True)]
     names = [
@@ -379,13 +375,13 @@ def disagreement(
         values = [(name, a[name], b[name])]
         if name == "checkpoints" and len(a[name]) == len(b[name]):
             values = [
-                (f"{key} of checkpoint {number}", mine.get(key), other.get(key))
-                for number, (mine, other) in enumerate(zip(a[name], b[name], strict=True), start=1)
+                (f"{key} of checkpoint {number}", checkpoint_a.get(key), checkpoint_b.get(key))
+                for number, (checkpoint_a, checkpoint_b) in enumerate(zip(a[name], b[name], strict=True), start=1)
                 for key in ("operation", "first_step", "ordered_step")
             ]
-        for part, mine, other in values:
-            if mine != other:
-                return f"{_name(a)}: {part} is {mine} {here} and {other} {there}"
+        for part, value_a, value_b in values:
+            if value_a != value_b:
+                return f"{_name(a)}: {part} is {value_a} {here} and {value_b} {there}"
     return None
 
 
@@ -393,15 +389,15 @@ def disagreements(
     a: Sequence[Mapping[str, Any]], b: Sequence[Mapping[str, Any]], here: str, there: str, ignore: Collection[str] = ()
 ) -> list[str]:
     """Return a phrase for each episode that differs between two logs, or that one of them lacks."""
-    mine, others = ({key_of(each): each for each in records} for records in (a, b))
+    records_a, records_b = ({key_of(record): record for record in records} for records in (a, b))
     phrases: list[str | None] = []
-    for key in sorted({*mine, *others}):
-        if key in mine and key in others:
-            phrases.append(disagreement(mine[key], others[key], here, there, ignore))
-        elif key in mine:
-            phrases.append(f"{_name(mine[key])} is {here} and not {there}")
+    for key in sorted({*records_a, *records_b}):
+        if key in records_a and key in records_b:
+            phrases.append(disagreement(records_a[key], records_b[key], here, there, ignore))
+        elif key in records_a:
+            phrases.append(f"{_name(records_a[key])} is {here} and not {there}")
         else:
-            phrases.append(f"{_name(others[key])} is {there} and not {here}")
+            phrases.append(f"{_name(records_b[key])} is {there} and not {here}")
     return [phrase for phrase in phrases if phrase is not None]
 
 

@@ -61,13 +61,7 @@ def write_report(directory: str | Path) -> Run:
     """Read the log under ``directory`` and write ``report.json`` and ``report.md`` into it.
 
     ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
-    another process may write to it.
-
-    Returns:
-        The evaluation with warnings, see `read_run`.
-
-    Raises:
-        MemobenchError: see `read_run`.
+    another process may write to it. Return the evaluation with warnings, see `read_run`.
     """
     directory = Path(directory)
     run = read_run(directory)
@@ -102,18 +96,18 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
         sections = [
             Section("Evaluations", [evaluations_table(runs, notes), joined_table(runs)], notes=notes),
             *sections,
-            *(comparison_section(each, overall=True) for each in controls),
+            *(comparison_section(control, overall=True) for control in controls),
             *([granularity_section(runs, levels)] if levels else []),
         ]
         for run in runs:
             section, *evidence = _sections(run)
-            where = f"Evaluation in {', '.join(str(each.folder) for each in run.evaluations)}."
+            where = f"Evaluation in {', '.join(str(evaluation.folder) for evaluation in run.evaluations)}."
             tables = [table for table in section.tables if table.key != "tasks"]  # rates by task are joined
             section = replace(section, title=run.name, tables=tables, sentences=[where, *section.sentences])
             sections += [section, *evidence]
         data = {"evaluations": {run.name: evaluation_data(run) for run in runs}, "notes": notes}
         if controls:
-            data["controls"] = [comparison_data(each, overall=True) for each in controls]
+            data["controls"] = [comparison_data(control, overall=True) for control in controls]
         if levels:
             data["granularity"] = {
                 name: {"level": level, "own_labels": _percentages(own.average)} for name, (level, own) in levels.items()
@@ -380,25 +374,25 @@ def joined_table(runs: Sequence[Run]) -> Table:
     metrics = tuple(runs[0].summary.average)
     absent: Row = dict.fromkeys(metrics, Rate(None, 0))
     summaries = [run.summary for run in runs]
-    tasks = [{name: task.rates for name, task in each.tasks.items()} for each in summaries]
+    tasks = [{name: task.rates for name, task in summary.tasks.items()} for summary in summaries]
     rows: list[tuple[Cell, ...]] = []
     strong, rules = set(), set()
 
     def add(name: str, sources: Iterable[Mapping[str, Row]]) -> None:
-        each = [source.get(name, absent) for source in sources]
-        rows.append((name, *(row[metric] for metric in metrics for row in each)))
+        of_runs = [source.get(name, absent) for source in sources]
+        rows.append((name, *(row[metric] for metric in metrics for row in of_runs)))
 
     for memory_type in GROUPS:
-        names = dict.fromkeys(name for each in summaries for name in each.tasks_of(memory_type))
+        names = dict.fromkeys(name for summary in summaries for name in summary.tasks_of(memory_type))
         for name in names:
             add(Name(name), tasks)
         if names:
             strong.add(len(rows))
-            add(memory_type, (each.memory_types for each in summaries))
+            add(memory_type, (summary.memory_types for summary in summaries))
             rules.add(len(rows))
-    for name in dict.fromkeys(name for each in summaries for name in each.means):
+    for name in dict.fromkeys(name for summary in summaries for name in summary.means):
         strong.add(len(rows))
-        add(name, (each.means for each in summaries))
+        add(name, (summary.means for summary in summaries))
     table = Table(
         "joined",
         "Rates by task",
@@ -495,11 +489,7 @@ def granularity_section(runs: Sequence[Run], levels: Mapping[str, tuple[str, Sum
 
 
 def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
-    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs.
-
-    Raises:
-        MemobenchError: a rollout has another number of checkpoints than its task.
-    """
+    """Return rollouts with the operation labels of a subgoal level; tasks that the catalogue lacks keep theirs."""
     index = LEVELS.index(level)
     result: list[Record] = []
     for record in records:

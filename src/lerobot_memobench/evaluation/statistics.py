@@ -126,7 +126,6 @@ def holm(values: Sequence[float]) -> list[float]:
 # --- bootstrap intervals ---
 
 DRAWS = 2000
-"""Bootstrap draws."""
 
 Array = NDArray[np.float64]
 
@@ -163,6 +162,7 @@ def newcombe(a: Array, b: Array, weights: Array) -> tuple[float, float]:
     """
     n = 1 / float(np.sum(weights**2))
     p, q = float(weights @ a), float(weights @ b)
+    # A sum of weights may exceed 1 by rounding.
     (low_p, high_p), (low_q, high_q) = (wilson(min(max(rate, 0.0), 1.0), n) for rate in (p, q))
     together = float(weights @ ((a - p) * (b - q)))
     spread = math.sqrt(float(weights @ (a - p) ** 2) * float(weights @ (b - q) ** 2))

@@ -320,10 +320,8 @@ PLAIN = Console(width=10_000, markup=False, highlight=False)
 class Unbroken:
     """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
 
-    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge.
-
-    Args:
-        table: not to be changed any more. column: that of the names.
+    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge. ``table`` must
+    not change any more; ``column`` is that of the names.
     """
 
     def __init__(self, table: RichTable, column: int = 0) -> None:
@@ -347,7 +345,7 @@ class Unbroken:
         columns = self.table.columns
         after = columns[self.column + 1 :]
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
-        least, most = ([max(one[end] for one in each) for each in wished] for end in (0, 1))
+        least, most = ([max(size[end] for size in sizes) for sizes in wished] for end in (0, 1))
         space = room - INDENT * len(after)
         last = min(most[-1], space - sum(most[:-1]))  # text at the end of a row takes the remaining width
         widths = [*most[:-1], last] if last >= least[-1] else least
@@ -394,8 +392,8 @@ def terminal_table(table: Table) -> RichTable | Unbroken:
     if table.best:
         result.caption = "* best of its column"
         result.caption_justify = "left"
-    named = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
-    return result if named is None else Unbroken(result, named)
+    names_at = next((k for k in range(len(table.header)) if any(isinstance(row[k], Name) for row in table.rows)), None)
+    return result if names_at is None else Unbroken(result, names_at)
 
 
 def _in_parts(table: Table) -> list[Table]:

@@ -149,7 +149,7 @@ def adding_resume_hint(program: str, how: Callable[[], str]) -> Iterator[None]:
             os.write(2, f"{program}: ended by SIGTERM; {how()}\n".encode())
         finally:
             _kill_descendants()
-            os._exit(128 + number)
+            os._exit(128 + number)  # as shells report a signal
 
     before = signal.getsignal(signal.SIGTERM) if threading.current_thread() is threading.main_thread() else None
     ours = before is signal.SIG_DFL or getattr(before, "__qualname__", None) == end.__qualname__
@@ -185,12 +185,12 @@ def _kill_descendants() -> None:
 
 def _descendants() -> set[psutil.Process]:
     """Return the descendants of this process, except multiprocessing's resource tracker, which cleans up."""
-    found = set()
+    descendants = set()
     for process in psutil.Process().children(recursive=True):
         with contextlib.suppress(psutil.Error):
             if not any("resource_tracker" in word for word in process.cmdline()):
-                found.add(process)
-    return found
+                descendants.add(process)
+    return descendants
 
 
 class HeldError(MemobenchError):

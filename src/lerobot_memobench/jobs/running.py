@@ -14,7 +14,6 @@ def run_jobs(jobs: Sequence[Job], *, workers: int = 1, progress: ProgressCallbac
     """Run the jobs that are not finished yet.
 
     Args:
-        jobs: the work.
         workers: number of jobs at a time.
         progress: called after each job; first for jobs that were finished before.
 

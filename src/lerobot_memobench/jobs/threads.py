@@ -46,7 +46,6 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
 
     Args:
         role: `ACTING` or `LEARNING`.
-        processes: number of processes that share the cores.
         large: whether the acting policy has `LARGE` parameters or more.
     """
     if role == ACTING and not large:
@@ -58,19 +57,19 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
 
 def use_threads(role: str) -> None:
     """Set this process's environment variables. Call it before numpy, torch or a renderer is loaded."""
-    given = os.environ
-    ours = set(filter(None, given.get(CHOSEN_HERE, "").split(",")))
+    environment = os.environ
+    ours = set(filter(None, environment.get(CHOSEN_HERE, "").split(",")))
     wanted = dict(ONE_EACH)
-    if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & (given.keys() - ours) and role == ACTING:
+    if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & (environment.keys() - ours) and role == ACTING:
         wanted |= SPINNING
     threads = torch_threads(role, sharing_processes())
     if threads is not None:
         wanted[TORCH] = str(threads)
-    chosen = {key: value for key, value in wanted.items() if key in ours or key not in given}
+    chosen = {key: value for key, value in wanted.items() if key in ours or key not in environment}
     for key in ours - chosen.keys():
-        given.pop(key, None)
-    given.update(chosen)
-    given[CHOSEN_HERE] = ",".join(sorted(chosen))
+        environment.pop(key, None)
+    environment.update(chosen)
+    environment[CHOSEN_HERE] = ",".join(sorted(chosen))
 
 
 def limit_torch(parameters: int) -> None:
@@ -109,19 +108,19 @@ def _affinity() -> set[int]:
 
 def physical_cores() -> int:
     """Return the number of physical cores of this process."""
-    found = set()
+    sibling_lists = set()
     for number in _affinity():
         path = Path(f"/sys/devices/system/cpu/cpu{number}/topology/thread_siblings_list")
         try:
-            found.add(path.read_text())
+            sibling_lists.add(path.read_text())
         except OSError:
-            found.add(str(number))
-    return len(found)
+            sibling_lists.add(str(number))
+    return len(sibling_lists)
 
 
 def cpu_model() -> str:
     """Return the processor's name."""
-    try:
+    try:  # platform.processor() names no model on Linux
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []
@@ -132,11 +131,11 @@ def cpu_model() -> str:
 def _quota() -> int | None:
     """Return the whole cores that the container of this process may use, None without a limit."""
     try:
-        place = Path("/proc/self/cgroup").read_text().rpartition("::")[2].strip()  # of control groups, version 2
+        group_path = Path("/proc/self/cgroup").read_text().rpartition("::")[2].strip()  # of control groups, version 2
     except OSError:
         return None
-    quotas, folder = [], _CGROUPS / place.strip("/")
-    # Limits of outer groups count too. In a container the place may be the host's, with the limit at the top.
+    quotas, folder = [], _CGROUPS / group_path.strip("/")
+    # Limits of outer groups count too. In a container the path may be the host's, with the limit at the top.
     for group in (folder, *folder.parents) if folder.is_relative_to(_CGROUPS) else (_CGROUPS,):
         with suppress(OSError, ValueError):
             quota, period = (group / "cpu.max").read_text().split()

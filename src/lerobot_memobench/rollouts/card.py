@@ -100,26 +100,19 @@ def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any
 
     They are its configuration as LeRobot encodes it, the seed of the run and, as a detector is not part of a
     checkpoint, the detector's hash.
-
-    Raises:
-        MemobenchError: the detector does not exist.
     """
-    kept = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
-    detector = detector_hash(kept)
+    recorded = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
+    detector = detector_hash(recorded)
     return {
         "type": settings.get("type"),
         "seed": seed,
-        "settings": kept,
+        "settings": recorded,
         **({} if detector is None else {"detector_sha256": detector}),
     }
 
 
 def detector_hash(settings: Mapping[str, Any]) -> str | None:
-    """Return the hash of the detector that a policy reads objects from, None without one.
-
-    Raises:
-        MemobenchError: the detector does not exist.
-    """
+    """Return the hash of the detector that a policy reads objects from, None without one; raise if it is missing."""
     if settings.get("detector") is None:
         return None
     from lerobot_memobench.perception.weights import detector_file
@@ -138,13 +131,13 @@ def training_facts(folder: Path) -> dict[str, Any] | None:
     except (FileNotFoundError, MemobenchError):
         return None
     dataset = config["dataset"]
-    found = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
-    found["steps"] = config.get("steps")
-    root = Path(str(found["root"] or ""))
-    if found["root"] and os.path.isdir(root / "meta"):  # pathlib raises at names that are too long
+    facts = {key: dataset.get(key) for key in ("repo_id", "revision", "root", "episodes")}
+    facts["steps"] = config.get("steps")
+    root = Path(str(facts["root"] or ""))
+    if facts["root"] and os.path.isdir(root / "meta"):  # pathlib raises at names that are too long
         files = sorted(path for path in [*files_below(root / "meta"), root / "manifest.json"] if path.is_file())
-        found["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
-    return found
+        facts["sha256"] = tree_hash({str(path.relative_to(root)): file_hash(path) for path in files})
+    return facts
 
 
 # --- facts of one start on this machine: versions, commit, processor ---
@@ -166,13 +159,13 @@ def run_facts(command: Sequence[str], batch: int) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions on which an evaluation's numbers may depend."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            installed[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            installed[name] = "not installed"
+    return installed
 
 
 def git_commit() -> str | None:
@@ -225,12 +218,12 @@ def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool =
 
 def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[dict[str, Any]]:
     """Return runs without repetitions; ``times`` counts the starts of each."""
-    found: list[dict[str, Any]] = []
+    distinct: list[dict[str, Any]] = []
     for run in runs:
-        same = next((r for r in found if all(r.get(key) == run.get(key) for key in {*r, *run} - {"times"})), None)
+        same = next((r for r in distinct if all(r.get(key) == run.get(key) for key in {*r, *run} - {"times"})), None)
         times = run.get("times", 1)
         if same is None:
-            found.append({**run, "times": times})
+            distinct.append({**run, "times": times})
         else:
             same["times"] = same["times"] + times if again else max(same["times"], times)
-    return found
+    return distinct

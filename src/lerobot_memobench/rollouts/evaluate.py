@@ -41,7 +41,6 @@ from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, PlannedTask, S
 from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, roll
 
 VIDEOS = "videos"
-"""Folder of the videos, in that of the log."""
 
 Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
@@ -58,7 +57,6 @@ def run_evaluation(
     Args:
         note: called with notes, and with the command that resumes a run that breaks off.
         begin: called with a line on the evaluation before it starts.
-        advance: see `Advance`.
 
     Raises:
         MemobenchError: the folder holds another evaluation, or weights are missing. Any error of LeRobot.
@@ -91,7 +89,6 @@ def _summary(plan: EvaluationPlan) -> str:
 
 
 def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note: Note, advance: Advance) -> Run:
-    """Run the batches that are left."""
     ended = False
 
     def begin() -> None:
@@ -119,12 +116,10 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     Args:
         cells: the batches, those of one task in succession.
         begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
-
-    Raises:
-        MemobenchError: the policy and the environment do not fit. Any error of LeRobot.
     """
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
+    # As LeRobot's own command sets them, before it makes the policy.
     torch.backends.cudnn.benchmark = True
     torch.backends.cuda.matmul.allow_tf32 = True
     set_seed(plan.seed)
@@ -216,9 +211,9 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
     if not has_log(folder):
         return card
     earlier = read_evaluation(folder)
-    if found := differences_of_parts(earlier, card):
+    if unlike := differences_of_parts(earlier, card):
         raise MemobenchError(
-            f"{folder} holds an evaluation with another protocol ({'; '.join(found)}, there and now); repeat its "
+            f"{folder} holds an evaluation with another protocol ({'; '.join(unlike)}, there and now); repeat its "
             "settings to resume it, or choose another output_dir="
         )
     if "runs" not in earlier:  # LeRobot's own command wrote it
@@ -237,11 +232,11 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
 def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """Return the differences of two starts on which numbers may depend: the batch size, and the first version."""
     sizes = {"batch_size": earlier["batch_size"]}, {"batch_size": now["batch_size"]}
-    found = []
-    for there, here in (sizes, (earlier["versions"], now["versions"])):
-        changed = [f"{key} {there[key]}, now {here[key]}" for key in here if there.get(key, here[key]) != here[key]]
-        found += changed[:1]
-    return found
+    differences = []
+    for old, new in (sizes, (earlier["versions"], now["versions"])):
+        changed = [f"{key} {old[key]}, now {new[key]}" for key in new if old.get(key, new[key]) != new[key]]
+        differences += changed[:1]
+    return differences
 
 
 def missing(plan: EvaluationPlan) -> list[Cell]:
@@ -298,11 +293,7 @@ def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
 
 @contextmanager
 def locked_folder(folder: Path) -> Iterator[None]:
-    """Make a folder and lock it while it is written to; afterwards new folders that are empty are removed.
-
-    Raises:
-        MemobenchError: another run writes to it, or it is a file.
-    """
+    """Make a folder and lock it, see `locked`; afterwards new folders that are empty are removed."""
     check_folder(folder)
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -311,6 +302,6 @@ def locked_folder(folder: Path) -> Iterator[None]:
             yield
         finally:
             for path in new:
-                for child in [*sorted(path.rglob("*"), reverse=True), path]:
+                for child in [*sorted(path.rglob("*"), reverse=True), path]:  # children first
                     if child.is_dir() and not any(child.iterdir()):
                         child.rmdir()

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 SCRIPTED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
 """Policies whose actions the environment offers -> the setting by which it does."""
-LARGEST_BATCH = 64
+LARGEST_BATCH = 64  # LeRobot's own limit
 OBJECT_BATCH = 10
 """Environments at once, in one process, of a policy that observes objects and runs on a CPU: a control step of one
 episode took 3.8 ms, against 6.1 ms with one environment."""
@@ -62,12 +62,9 @@ class EvaluationPlan:
 
     Attributes:
         settings: complete settings, equal to those of the card.
-        policy: configuration of the policy.
-        environment: configuration of the environment.
         grid: episodes of each task, in batches.
         output: folder of the evaluation, or of its part (``shard=``).
         log: folder of the episode log, the report and the card.
-        options: options of the run, such as shards and memory reads.
         command: the typed command line, for the card.
     """
 
@@ -127,8 +124,8 @@ class EvaluationPlan:
 
 def with_changes(line: Sequence[str], **changes: object) -> list[str]:
     """Return a command line in which these keys have other values; None removes one."""
-    given = {key: str(value) for key, value in changes.items() if value is not None}
-    return as_command_line(without(parse_words(line), *changes) | given)
+    values = {key: str(value) for key, value in changes.items() if value is not None}
+    return as_command_line(without(parse_words(line), *changes) | values)
 
 
 # --- making it ---
@@ -143,16 +140,12 @@ def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation for the words of a command line."""
     from lerobot_memobench.rollouts.settings import read_settings
 
-    options, others = take_run_options(words)
-    return make_plan(read_settings(others), options, ("lerobot", "eval", *as_command_line(words)))
+    options, setting_words = take_run_options(words)
+    return make_plan(read_settings(setting_words), options, ("lerobot", "eval", *as_command_line(words)))
 
 
 def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequence[str]) -> EvaluationPlan:
-    """Complete the settings of the benchmark's evaluation and check them.
-
-    Raises:
-        MemobenchError: it cannot be run.
-    """
+    """Complete the settings of the benchmark's evaluation and check them; raise if it cannot be run."""
     from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
     from lerobot_memobench.rollouts.settings import policy_of, with_policy
     from lerobot_memobench.sim.files import check_assets
@@ -164,8 +157,8 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
     settings = with_device(with_policy(settings), options)
     policy = policy_of(settings)
     check_expert(policy, settings.env.get("suite", PUBLISHED))
-    named = settings.env.get("convention") or (MIRRORED if settings.env.get("camera_name_mapping") else None)
-    convention = chosen_convention(settings.policy_path, policy, named, settings.rename_map)
+    requested = settings.env.get("convention") or (MIRRORED if settings.env.get("camera_name_mapping") else None)
+    convention = chosen_convention(settings.policy_path, policy, requested, settings.rename_map)
     settings = settings if convention is None else replace(settings, env={**settings.env, "convention": convention})
     output = _output(settings, options, policy)
     log = Path(settings.env.get("log_dir") or output)
@@ -185,11 +178,7 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
 
 
 def make_grid(settings: EvaluationSettings, environment: MemobenchEnvConfig) -> Grid:
-    """Return the episodes of an evaluation.
-
-    Raises:
-        MemobenchError: unknown tasks, or no episodes.
-    """
+    """Return the episodes of an evaluation; raise for unknown tasks, or without episodes."""
     tasks = tuple(PlannedTask(*chosen) for chosen in environment.selected())
     runs, seed = settings.episodes, settings.seed
     if runs is None or seed is None or runs < 1:
@@ -202,19 +191,18 @@ def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTraine
     if settings.output_dir is not None:
         return Path(settings.output_dir) / (options.shard.folder if options.shard is not None else "")
     base = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_memobench_{policy.type}"
-    others = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
-    return next(folder for folder in itertools.chain([base], others) if not folder.exists())
+    # Two commands may begin in the same second.
+    numbered = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
+    return next(folder for folder in itertools.chain([base], numbered) if not folder.exists())
 
 
 # --- checks of a plan ---
 
 
 def check_policy_fits(plan: EvaluationPlan) -> None:
-    """Refuse a policy whose inputs, settings or checkpoint do not suit the evaluation.
+    """Refuse a policy whose inputs, settings or memory reads do not suit the evaluation.
 
-    Raises:
-        MemobenchError: the environment lacks inputs of the policy, the checkpoint is damaged or was trained under other
-            settings, or ``memory_reads`` is asked of a policy that reports none.
+    A damaged checkpoint is refused, and one that was trained under other settings.
     """
     policy, path = plan.policy, plan.policy_path
     if path is not None:
@@ -237,11 +225,7 @@ def check_policy_fits(plan: EvaluationPlan) -> None:
 
 
 def check_corruption(plan: EvaluationPlan) -> None:
-    """Refuse ``corrupt`` for a policy that does not offer its memory, and a swap without another row.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
+    """Refuse ``corrupt`` for a policy that does not offer its memory, and a swap without another row."""
     how, policy = plan.environment.corrupt, plan.policy
     if how == INTACT:
         return
@@ -262,11 +246,7 @@ def check_corruption(plan: EvaluationPlan) -> None:
 
 
 def check_split(plan: EvaluationPlan) -> None:
-    """Refuse seeds outside the split that was named, and the sealed seeds or a salt where it was not.
-
-    Raises:
-        MemobenchError: they are refused.
-    """
+    """Refuse seeds outside the split that was named, and the sealed seeds or a salt where it was not."""
     split, seeds, sealed = plan.options.split, plan.seeds, SPLITS[SEALED]
     if plan.environment.suite in LIBERO_SUITES and split not in (None, PAPER):
         raise MemobenchError(
@@ -289,11 +269,7 @@ def check_split(plan: EvaluationPlan) -> None:
 
 
 def check_expert(policy: PreTrainedConfig, suite: str) -> None:
-    """Refuse the scripted policies in LIBERO's suites.
-
-    Raises:
-        MemobenchError: it is refused.
-    """
+    """Refuse the scripted policies in LIBERO's suites."""
     if policy.type in SCRIPTED and suite in LIBERO_SUITES:
         raise MemobenchError(
             f"found suite={suite} with policy={policy.type}; LIBERO's tasks have no scripted expert: name a policy, "
@@ -327,10 +303,7 @@ def check_scenes(plan: EvaluationPlan) -> None:
 def with_device(settings: EvaluationSettings, options: RunOptions) -> EvaluationSettings:
     """Return settings with the CPU as the policy's device where the machine has no other.
 
-    Parts decide on their own machine: this machine may be a login node.
-
-    Raises:
-        MemobenchError: the user named a device that this machine lacks.
+    Parts decide on their own machine: this machine may be a login node. A named device that is missing raises.
     """
     import torch
 
@@ -395,12 +368,12 @@ def with_batch_size(
     suit the cores and divide the episodes. A resumed run keeps its number, because a policy's samples may depend on it.
     Parts run one environment each: by cores, each machine would divide the evaluation differently.
     """
-    given, episodes = settings.batch_size or 0, settings.episodes or 1
-    if given < 0:
+    requested, episodes = settings.batch_size or 0, settings.episodes or 1
+    if requested < 0:
         raise MemobenchError(
-            f"found batch_size={given}; expected at least 1 environment at once, or 0 to choose by the machine"
+            f"found batch_size={requested}; expected at least 1 environment at once, or 0 to choose by the machine"
         )
-    if given:
+    if requested:
         return settings
     if options.resume and (earlier := earlier_batch_size(log)) is not None:
         return replace(settings, batch_size=earlier)
@@ -411,7 +384,7 @@ def with_batch_size(
     learned = policy.type not in SCRIPTED and policy.device == "cpu"
     if learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs:
         return replace(settings, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
-    limit = max(1, min(int(cores() * 0.7), most))
+    limit = max(1, min(int(cores() * 0.7), most))  # LeRobot's share of the cores
     return replace(settings, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
 
 
@@ -431,7 +404,6 @@ class RunOptions:
     Attributes:
         split: the split whose seeds are run, one of `EVALUATED`; None: by `seed=`.
         memory_reads: write the weight of each remembered frame in each chunk next to the log.
-        resume: resume the evaluation in the output folder.
         shard: run this part alone.
         shards: run this many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
         workers: 0: as many as shards.
@@ -451,11 +423,7 @@ class RunOptions:
 
 
 def take_run_options(words: Mapping[str, str]) -> tuple[RunOptions, dict[str, str]]:
-    """Return the run options of a command line, and the words without them.
-
-    Raises:
-        MemobenchError: a value that an option does not accept, or options that exclude each other.
-    """
+    """Return the run options of a command line, and the other words; raise for options that exclude each other."""
     options = RunOptions(
         split=words.get("split"),
         memory_reads=value_of("memory_reads", bool, words.get("memory_reads", "false")),
@@ -549,8 +517,8 @@ class Grid:
 
     def cells(self, shard: Shard | None = None) -> list[Cell]:
         """Return the batches of a shard, or all. A batch is never divided: the policy acts on it as a whole."""
-        found = [(task, number) for task in self.tasks for number in range(-(-self.runs // self.batch))]
-        return found if shard is None else found[shard.of(len(found))]
+        cells = [(task, number) for task in self.tasks for number in range(-(-self.runs // self.batch))]
+        return cells if shard is None else cells[shard.of(len(cells))]
 
     def runs_of(self, number: int) -> range:
         """Return the runs of a task's batch."""

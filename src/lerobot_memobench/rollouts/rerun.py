@@ -44,13 +44,13 @@ from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, m
 from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
 
 MOST_STEPS = 400 * HORIZON
-"""Most control steps of an episode with its pauses and holds."""
+"""Most control steps of an episode with its pauses and holds; those of a strict one may take 180,000."""
 MOST = {"horizon": 10 * HORIZON, "videos": MOST_EPISODES}
 """Setting of the environment -> its largest number."""
 REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "discover_packages_path")
 """Settings of a policy that change more than numbers. All other numbers and truth values are accepted."""
 SERVERS = ("host", "servers")
-WORD = re.compile(r"[\w.,+' ()-]*")
+WORD = re.compile(r"[\w.,+' ()-]*")  # no slash, which paths and names of repositories have
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
 SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
 OBSERVATION = re.compile(r"[\w./-]+")
@@ -66,14 +66,10 @@ def repeat(
     """Repeat the evaluation of a card and compare every episode; return 1 where one ended differently.
 
     Args:
-        path: the card, or its folder.
+        path, server: see `read_repeatable`.
         out: folder of the repetition, a dated one when None.
-        server: see `read_repeatable`.
         evaluate: runs the plan and returns its exit status.
         say: called with differences of this machine, and with the result.
-
-    Raises:
-        MemobenchError: the card cannot be repeated here.
     """
     card, settings = read_repeatable(path, server)
     check_policy(card, settings.policy_path)
@@ -81,10 +77,10 @@ def repeat(
         say(f"note: {note}")
     plan = plan_of_evaluation(card, settings, out)
     here = plan.environment.settings.protocol_block
-    if found := differences(card["protocol"], here):
+    if changes := differences(card["protocol"], here):
         start = card["runs"][-1]
         raise MemobenchError(
-            f"another version ran the card ({'; '.join(found)}, there and here); repeat it with that version "
+            f"another version ran the card ({'; '.join(changes)}, there and here); repeat it with that version "
             f"({start['versions'].get(PACKAGES[0], 'not known')}, commit {start['git_commit'] or 'not known'})"
         )
     episodes = read_log(path if path.is_dir() else path.parent)
@@ -107,9 +103,6 @@ def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, An
     Args:
         path: the card's file or its folder.
         server: address of the policy's server (``host:port``, or several with commas); the card's when None.
-
-    Raises:
-        MemobenchError: there is no card, or a setting is refused.
     """
     card = read_evaluation(path, whole=True)
     return card, allowed_settings(card_settings(card), server)
@@ -149,8 +142,8 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
             "command yourself if you trust it"
         )
     wanted = {episode for cell in grid.cells(plan.options.shard) for episode in grid.episodes(cell)}
-    named = {key_of(each) for each in episodes if "not_run" in each or "steps" in each}
-    for task, episode in sorted(wanted ^ named)[:1]:
+    logged = {key_of(record) for record in episodes if "not_run" in record or "steps" in record}
+    for task, episode in sorted(wanted ^ logged)[:1]:
         problem = "log lacks" if (task, episode) in wanted else "card does not ask for"
         raise MemobenchError(
             f"the {problem} {task}, episode {episode}; expected the outcome of each of the "
@@ -159,11 +152,7 @@ def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]],
 
 
 def check_policy(card: Mapping[str, Any], path: str | None) -> None:
-    """Refuse to repeat an evaluation with another checkpoint or detector.
-
-    Raises:
-        MemobenchError: one of them differs, or the card does not identify it.
-    """
+    """Refuse to repeat an evaluation with another checkpoint or detector, or without their hashes on the card."""
     if path is None:
         return
     policy = card["policy"]
@@ -175,11 +164,11 @@ def check_policy(card: Mapping[str, Any], path: str | None) -> None:
             policy.get("detector_sha256"),
         ),
     )
-    for name, here, there in pairs:
-        if here != there:
+    for name, here, stored in pairs:
+        if here != stored:
             raise MemobenchError(
-                f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(there)[:12]} on the card); "
-                "the results would be those of another policy"
+                f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(stored)[:12]} on the "
+                "card); the results would be those of another policy"
             )
 
 
@@ -206,9 +195,6 @@ def allowed_settings(settings: EvaluationSettings, server: str | None = None) ->
 
     Args:
         server: address of the policy's server, in place of the card's.
-
-    Raises:
-        MemobenchError: a card may not hold one of them.
     """
     if not all(OBSERVATION.fullmatch(name) for pair in settings.rename_map.items() for name in pair):
         raise _refused("rename_map", settings.rename_map, "expected names of observations")
@@ -294,8 +280,8 @@ def _are_here(text: str) -> bool:
 def _is_device_here(text: str) -> bool:
     import torch
 
-    found = DEVICE.fullmatch(text)
-    return found is not None and int((found[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
+    match = DEVICE.fullmatch(text)
+    return match is not None and int((match[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
 
 
 TEXTS: dict[str, tuple[Callable[[str], Any], str]] = {

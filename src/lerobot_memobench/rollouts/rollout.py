@@ -96,10 +96,9 @@ def plans_chunks(policy: Any) -> bool:
 
 
 class Actor:
-    """A policy between its processors.
+    """A policy of LeRobot's interface between its processors.
 
     Args:
-        policy: of LeRobot's interface.
         before: processors of observations: the environment's, then the policy's.
         after: processors of actions: the policy's, then the environment's.
     """
@@ -202,11 +201,7 @@ class Inputs:
 
 
 class BatchSeeds:
-    """Seed the generators of a batch: Python's, NumPy's, torch's and the policy's own.
-
-    Args:
-        seed: of the run.
-    """
+    """Seed the generators of a batch by the seed of the run: Python's, NumPy's, torch's and the policy's own."""
 
     def __init__(self, policy: Any, seed: int) -> None:
         self._policy, self._seed = policy, seed
@@ -228,4 +223,5 @@ class BatchSeeds:
 def batch_seed(seed: int, task: str, first: int, *more: int) -> int:
     """Return the seed (32 bits) of the batch of a task whose first episode has the seed ``first``."""
     text = " ".join(str(part) for part in (seed, task, first, *more))
+    # NumPy's legacy generator takes no more than 32 bits.
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=4).digest(), "big")

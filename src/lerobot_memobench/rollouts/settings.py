@@ -33,7 +33,7 @@ OWN = ("task", "task_ids", "tasks", "task_dir", "log_dir", "resume")
 ENVIRONMENT: dict[str, Any] = {
     name: kind
     for name, kind in typing.get_type_hints(MemobenchEnvConfig).items()
-    if name in (*OWN, *(each.name for each in fields(EnvSettings)))
+    if name in (*OWN, *(setting.name for setting in fields(EnvSettings)))
 }
 """Setting of the environment -> its type."""
 OTHERS = {
@@ -87,9 +87,9 @@ class EvaluationSettings:
         env = {name: value for name, value in self.env.items() if name not in left_out}
         policy = dict(self.policy)
         for section, name in ((policy, "path"), (env, "task_dir")):
-            if (named := section.get(name)) is not None and Path(named).expanduser().exists():
-                portable = portable_path(named) if section is policy else named
-                section[name] = str(Path(named).expanduser().absolute()) if portable == named else portable
+            if (path := section.get(name)) is not None and Path(path).expanduser().exists():
+                portable = portable_path(path) if section is policy else path
+                section[name] = str(Path(path).expanduser().absolute()) if portable == path else portable
         loop = {name: getattr(self, name) for name in ("batch_size", "use_async_envs")}
         return {"env": env, "policy": policy, **loop, "rename_map": dict(self.rename_map)}
 
@@ -113,33 +113,29 @@ def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
     return replace(settings, policy={**settings.policy, **given_values(chosen, settings.policy, "policy.")})
 
 
-def typed_settings(given: Mapping[str, Any]) -> EvaluationSettings:
-    """Return settings for LeRobot's names, nested.
-
-    Raises:
-        MemobenchError: an evaluation of the benchmark has no such setting, or a value has another type.
-    """
+def typed_settings(nested: Mapping[str, Any]) -> EvaluationSettings:
+    """Return settings for LeRobot's names, nested; raise for unknown names, and values of another type."""
     known = field_types(EvalPipelineConfig)
-    env, policy, loop = (_section(name, given.get(name)) for name in ("env", "policy", "eval"))
-    others = {name: value for name, value in given.items() if name not in ("env", "policy", "eval")}
+    env, policy, loop = (_section(name, nested.get(name)) for name in ("env", "policy", "eval"))
+    top_level = {name: value for name, value in nested.items() if name not in ("env", "policy", "eval")}
     kinds = {**known, **{f"eval.{name}": kind for name, kind in field_types(known["eval"]).items()}}
-    found: dict[str, Any] = {}
-    for key, value in {**others, **{f"eval.{name}": value for name, value in loop.items()}}.items():
+    loop_fields: dict[str, Any] = {}
+    for key, value in {**top_level, **{f"eval.{name}": value for name, value in loop.items()}}.items():
         if key in OTHERS:
-            found[OTHERS[key]] = value_of(key, kinds[key], value)
+            loop_fields[OTHERS[key]] = value_of(key, kinds[key], value)
         elif key not in WITHOUT_EFFECT:
             raise _without_setting(key)
     for name in env:
         if name not in ENVIRONMENT and f"env.{name}" not in WITHOUT_EFFECT:
             raise _without_setting(f"env.{name}")
     typed = {name: value_of(f"env.{name}", ENVIRONMENT[name], env[name]) for name in env if name in ENVIRONMENT}
-    return EvaluationSettings(_without_lerobots_names(typed), policy, **found)
+    return EvaluationSettings(_without_lerobots_names(typed), policy, **loop_fields)
 
 
-def _section(name: str, given: Any) -> dict[str, Any]:
-    if not isinstance(given, Mapping | None):
-        raise MemobenchError(f"found {name}={given}; expected settings, such as {name}.<name>=")
-    return {**(given or {})}
+def _section(name: str, section: Any) -> dict[str, Any]:
+    if not isinstance(section, Mapping | None):
+        raise MemobenchError(f"found {name}={section}; expected settings, such as {name}.<name>=")
+    return {**(section or {})}
 
 
 def _without_setting(key: str) -> MemobenchError:
@@ -148,11 +144,7 @@ def _without_setting(key: str) -> MemobenchError:
 
 
 def _without_lerobots_names(env: Mapping[str, Any]) -> dict[str, Any]:
-    """Return settings with ``suite`` and ``tasks`` instead of LeRobot's ``task`` and ``task_ids``.
-
-    Raises:
-        MemobenchError: they contradict each other, or name several suites.
-    """
+    """Return settings with ``suite`` and ``tasks`` instead of LeRobot's ``task`` and ``task_ids``, of one suite."""
     names = ("task", "task_ids")
     if not {*names} & {*env}:
         return {**env}
@@ -176,6 +168,6 @@ def policy_of(settings: EvaluationSettings) -> PreTrainedConfig:
     Raises:
         MemobenchError: the type is not known, or a value cannot be read. Others are the configuration's own.
     """
-    found: PreTrainedConfig = build_config(PreTrainedConfig, settings.policy, "policy")
-    found.pretrained_path = None  # it does not depend on the place of the checkpoint
-    return found
+    config: PreTrainedConfig = build_config(PreTrainedConfig, settings.policy, "policy")
+    config.pretrained_path = None  # it does not depend on the place of the checkpoint
+    return config

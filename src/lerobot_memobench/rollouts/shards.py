@@ -59,7 +59,6 @@ class ShardJob:
         program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
         words: the command line of the evaluation after ``lerobot eval``, without folders and run options.
         out: folder of the evaluation.
-        episodes: (task, episode) of the part.
         directory: where relative paths are looked up.
         at_once: parts that run at the same time.
     """
@@ -123,7 +122,7 @@ class ShardJob:
             )
             try:
                 status = process.wait()
-            except BaseException:
+            except BaseException:  # Ctrl-C too
                 process.kill()
                 process.wait()
                 raise
@@ -137,11 +136,7 @@ class ShardJob:
 
 
 def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> list[ShardJob]:
-    """Return a job for each part of an evaluation.
-
-    Args:
-        program: see `ShardJob`.
-        note: called with notes.
+    """Return a job for each part of an evaluation, which starts ``program``.
 
     Raises:
         MemobenchError: there are more parts than batches, or the folders hold another evaluation.
@@ -191,11 +186,7 @@ def part_folders(out: Path) -> list[Path]:
 
 
 def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
-    """Merge parts into the folder ``out`` and report the whole; see `merge`.
-
-    Raises:
-        MemobenchError: see `merge`; or another run writes to ``out``.
-    """
+    """Lock the folder ``out``, merge parts into it and report the whole; see `merge`."""
     with locked_folder(out):
         return _merge_and_report(out, folders)
 
@@ -236,28 +227,24 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the episodes of all parts, sorted, each once.
-
-    Raises:
-        MemobenchError: two parts disagree about an episode.
-    """
-    found: dict[Key, tuple[Path, Mapping[str, Any]]] = {}
+    """Return the episodes of all parts, sorted, each once; raise where two parts disagree about one."""
+    episodes: dict[Key, tuple[Path, Mapping[str, Any]]] = {}
     for folder, records in parts.items():
         for record in records:
-            known = found.setdefault(key_of(record), (folder, record))
+            known = episodes.setdefault(key_of(record), (folder, record))
             problem = disagreement(known[1], record, f"in {known[0]}", f"in {folder}")
             if problem is not None:
                 raise MemobenchError(f"{problem}; leave the wrong folder out")
-    return [dict(found[key][1]) for key in sorted(found)]
+    return [dict(episodes[key][1]) for key in sorted(episodes)]
 
 
 def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return one card for all folders; where LeRobot's own commands ran one of them, protocol and policy alone."""
-    (first, card), *others = cards.items()
-    for folder, other in others:
-        if found := differences_of_parts(card, other):
+    (first, card), *rest = cards.items()
+    for folder, other in rest:
+        if unlike := differences_of_parts(card, other):
             raise MemobenchError(
-                f"{first} and {folder} were run under different protocols ({'; '.join(found)}); merge parts of one "
+                f"{first} and {folder} were run under different protocols ({'; '.join(unlike)}); merge parts of one "
                 "evaluation"
             )
         if bool(card[POLICY]) != bool(other[POLICY]):  # else all episodes would get its name
@@ -265,13 +252,13 @@ def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
                 f"{folder if card[POLICY] else first} does not name the policy of its episodes, and another part does; "
                 "evaluate the policy again there, or leave that folder out"
             )
-    if not all("runs" in each for each in cards.values()):
+    if not all("runs" in part_card for part_card in cards.values()):
         protocol = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
         return {"format": card["format"], "protocol": protocol, POLICY: card[POLICY]}
     whole = {folder: read_evaluation(folder, whole=True) for folder in cards}
     joined = functools.reduce(partial(extended, again=False), whole.values())
-    for folder, each in whole.items():
-        for name, value in each["task_files"].items():
+    for folder, part_card in whole.items():
+        for name, value in part_card["task_files"].items():
             if joined["task_files"][name] != value:
                 raise MemobenchError(
                     f"the episodes of {name} in {folder} were run with other task files than the others"
@@ -281,13 +268,13 @@ def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
 
 def _share(source: Path, target: Path, pattern: str) -> None:
     """Link files of episodes into another folder, or copy them; existing ones are kept."""
-    for mine in sorted(source.glob(pattern)):
-        place = target / mine.name
-        if place.exists():
+    for file in sorted(source.glob(pattern)):
+        destination = target / file.name
+        if destination.exists():
             continue
         target.mkdir(parents=True, exist_ok=True)
-        with draft_of(place) as draft:
+        with draft_of(destination) as draft:
             try:
-                os.link(mine, draft)
+                os.link(file, draft)
             except OSError:  # another disk, or one without links
-                shutil.copyfile(mine, draft)
+                shutil.copyfile(file, draft)
