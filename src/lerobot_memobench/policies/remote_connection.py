@@ -353,7 +353,7 @@ class VlaEvalConnection(Connection):
                 payload[theirs] = _as_png(frame[ours])
         frames, self._frames = self._frames, []
         if frames and frames[0]:
-            payload |= {HISTORY[name]: [each[name] for each in frames] for name in frames[0]}
+            payload |= {HISTORY[name]: [past[name] for past in frames] for name in frames[0]}
             payload["episode_restart"] = True
         return self.ask({"type": "observation", "payload": payload})
 
@@ -368,11 +368,11 @@ class VlaEvalConnection(Connection):
                 f"the policy server at {self.address} has version {version} of {self.protocol}; expected version "
                 f"{PROTOCOL}: serve the policy with vla-eval {VERSION}"
             )
-        if not self._warned and (others := _other_formats(payload)):
-            logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
+        if not self._warned and (formats := _other_formats(payload)):
+            logger.warning("the policy server at %s works with %s", self.address, "; ".join(formats))
         self._warned = True
-        asked = payload.get("observation_params")
-        stated = {STATED: asked[STATED]} if isinstance(asked, dict) and STATED in asked else {}
+        params = payload.get("observation_params")
+        stated = {STATED: params[STATED]} if isinstance(params, dict) and STATED in params else {}
         return stated | {name: payload[name] for name in ("model_server", "harness_version") if name in payload}
 
     def _exchange(self, question: dict[str, Any]) -> dict[str, Any]:
