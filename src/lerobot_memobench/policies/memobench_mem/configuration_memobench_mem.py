@@ -348,14 +348,14 @@ class MemobenchMemConfig(PreTrainedConfig):
             raise UnreadError(
                 f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
                 f"out, or set it to its default, {json.dumps(unset[name])}.",
-                {one: unset[one] for one in unread},
+                {field_name: unset[field_name] for field_name in unread},
             )
         if self.memory == NONE:
             self.memory_fusion = None
 
     def _complete_memory(self) -> None:
         if self.memory == NONE:
-            if self.memory_settings in [asdict(mechanism_settings(one, {})) for one in OURS if self.memory_settings]:
+            if self.memory_settings in [asdict(mechanism_settings(name, {})) for name in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
             return
         mechanism = find_mechanism(self.memory)
@@ -379,20 +379,20 @@ class MemobenchMemConfig(PreTrainedConfig):
     # -- checks ----------------------------------------------------------------------------------------------------
 
     def _check_values(self) -> None:
-        for one in fields(self):
-            known, given = one.metadata.get("values"), getattr(self, one.name)
-            if known and given not in known and not (given is None and one.default is FROM_SIZE):
+        for setting in fields(self):
+            known, value = setting.metadata.get("values"), getattr(self, setting.name)
+            if known and value not in known and not (value is None and setting.default is FROM_SIZE):
                 raise MemobenchError(
-                    f"memobench_mem has no {one.name} '{given}': {nearest(str(given), known)} "
-                    f"Pass --policy.{one.name}=<one of {', '.join(known)}>."
+                    f"memobench_mem has no {setting.name} '{value}': {nearest(str(value), known)} "
+                    f"Pass --policy.{setting.name}=<one of {', '.join(known)}>."
                 )
 
     def _check_numbers(self) -> None:
-        for one in fields(self):
-            least, most = one.metadata.get("least", -math.inf), one.metadata.get("most", math.inf)
-            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, one.name) <= most:  # nor NaN
+        for setting in fields(self):
+            least, most = setting.metadata.get("least", -math.inf), setting.metadata.get("most", math.inf)
+            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, setting.name) <= most:  # nor NaN
                 raise MemobenchError(
-                    f"--policy.{one.name}={getattr(self, one.name)} is out of range; expected at least {least}"
+                    f"--policy.{setting.name}={getattr(self, setting.name)} is out of range; expected at least {least}"
                     + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
                 )
         if self.n_action_steps > self.chunk_size:
@@ -429,8 +429,8 @@ class MemobenchMemConfig(PreTrainedConfig):
     def fixed_by_training(self) -> tuple[str, ...]:
         """Fields that must keep their values when a checkpoint acts or its training is resumed."""
         # Ours first, because another setting is the cause of other inputs.
-        inherited = [one.name for one in fields(PreTrainedConfig)]
-        names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
+        inherited = [setting.name for setting in fields(PreTrainedConfig)]
+        names = [setting.name for setting in fields(self) if setting.name not in MAY_DIFFER]
         return tuple(sorted(names, key=inherited.__contains__))
 
     @property
@@ -546,7 +546,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     def validate_features(self) -> None:
         """Remove features that this perception does not read; with a detector, add its cameras."""
         unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
-        for key in [key for key, one in self.input_features.items() if one.type is unseen or key in CLOCK]:
+        for key in [key for key, feature in self.input_features.items() if feature.type is unseen or key in CLOCK]:
             del self.input_features[key]
         if self.uses_detector and not self.image_features:
             shape = (3, IMAGE_SIZE, IMAGE_SIZE)
@@ -590,7 +590,7 @@ class MemobenchMemConfig(PreTrainedConfig):
 
 def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
     """Return the conditions of the fields of a configuration that are not always used."""
-    return {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
+    return {setting.name: setting.metadata["used_if"] for setting in fields(config) if setting.metadata.get("used_if")}
 
 
 def memory_defaults() -> dict[str, Any]:
@@ -598,6 +598,6 @@ def memory_defaults() -> dict[str, Any]:
 
     ``memory_settings`` are not among them: construction converts them.
     """
-    own = {one.name: one.default for one in fields(MemobenchMemConfig)}
+    own = {setting.name: setting.default for setting in fields(MemobenchMemConfig)}
     of_memory = [name for name, condition in conditions().items() if condition in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
     return {name: own[name] for name in of_memory if name != "memory_settings"}

@@ -497,12 +497,12 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             overrides["modules_to_save"] = self.trained_whole(overrides["modules_to_save"])
         return overrides
 
-    def trained_whole(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return peft's ``modules_to_save``: the modules ``asked`` for, and the model's memory and heads."""
+    def trained_whole(self, requested: Iterable[str] = ()) -> list[str]:
+        """Return peft's ``modules_to_save``: the ``requested`` modules, and the model's memory and heads."""
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         own += [name for name in names if name.removeprefix("model.modulators.").isdecimal()]  # peft takes no list
-        return [*asked, *(end for end in own if end not in set(asked))]
+        return [*requested, *(end for end in own if end not in set(requested))]
 
 
 def _without_labels(batch: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -216,7 +216,7 @@ class MemoryMechanism(nn.Module, ABC):
         Frames of pictures are stored in bfloat16; weights are float32 in training and usually in a rollout.
         """
         tokens: Tensor = self.pool(frames)
-        own = next((one for name, one in self.named_parameters() if not name.startswith("pool.")), tokens)
+        own = next((parameter for name, parameter in self.named_parameters() if not name.startswith("pool.")), tokens)
         return tokens.to(torch.promote_types(tokens.dtype, own.dtype))
 
     def join(self, states: Sequence[State]) -> State:
@@ -225,8 +225,8 @@ class MemoryMechanism(nn.Module, ABC):
 
     def noised(self, state: State, generator: torch.Generator) -> State:
         """Return the state with noise on what it holds of frames, not on times and counts (``corrupt=noise``)."""
-        held = {name: value for name, value in state.items() if not name.endswith("steps")}
-        return {**state, **{name: with_noise(value, generator) for name, value in held.items()}}
+        contents = {name: value for name, value in state.items() if not name.endswith("steps")}
+        return {**state, **{name: with_noise(value, generator) for name, value in contents.items()}}
 
     # -- a training --------------------------------------------------------------------------------------------------
 
