@@ -100,8 +100,7 @@ class Stream:
 
     Attributes:
         frames: observations by their names at the policy, without a batch dimension.
-        task: the instruction.
-        indices: of the frames in the dataset.
+        task: the instruction. indices: of the frames in the dataset.
     """
 
     frames: tuple[dict[str, Tensor], ...]

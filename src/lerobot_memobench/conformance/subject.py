@@ -55,8 +55,7 @@ class Subject:
 
     Attributes:
         dataset: samples as in training, with the policy's delta timestamps.
-        streams: `STREAMS` episodes.
-        cameras: of the dataset.
+        streams: `STREAMS` episodes. cameras: of the dataset.
         numbers: (N,) index in ``dataset`` of each frame of the named dataset.
     """
 
@@ -138,7 +137,6 @@ class EqualNoise(TorchFunctionMode):
     DRAWS = (torch.randn, torch.randn_like, torch.normal, torch.rand, torch.rand_like, Tensor.normal_, Tensor.uniform_)
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call a function of torch, and replace the values that it drew."""
         drawn = function(*args, **(kwargs or {}))
         if function in self.DRAWS:
             width = drawn.shape[-1] if drawn.dim() > 1 else 1

@@ -273,7 +273,6 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
 
 
 def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
-    """Yield the reasons to refuse a step."""
     name, config = step.get("registry_name"), step.get("config") or {}
     if not isinstance(name, str) or "class" in step:
         yield f"names the class {step.get('class')!r}, which LeRobot would import and call"

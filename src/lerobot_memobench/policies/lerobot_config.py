@@ -97,13 +97,7 @@ def check_device(device: str | None) -> None:
 
 
 def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the evaluation's file.
-
-    Args:
-        policy: its configuration.
-        path: its checkpoint; None for a policy without one.
-        settings: settings of its environments.
-    """
+    """Return the description of a policy (its configuration, and its checkpoint or None) for the evaluation's file."""
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
     weights = None if path is None else checkpoint_hash(path)
     hashed = {"sha256": weights} if path is not None and Path(path).is_dir() else {}

@@ -323,7 +323,6 @@ class Client:
         return self._config.send_prompt and step % self._config.prompt_stride == 0
 
     def _frame(self, observation: EnvObservation) -> NamedValues:
-        """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
         values = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
         if observation.scalar(STEP) is not None:

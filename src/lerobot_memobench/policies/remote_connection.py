@@ -152,11 +152,7 @@ class Connection:
         return metadata if isinstance(metadata, dict) else {}
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a message and return the answer.
-
-        Raises:
-            MemobenchError: the server failed, disconnected, took too long, or has another protocol.
-        """
+        """Return the answer; a `MemobenchError` if the server fails, is too slow or has another protocol."""
         try:
             answer = self._exchange(question)
         except TimeoutError as error:
@@ -391,7 +387,6 @@ class VlaEvalConnection(Connection):
         self._send(msgpack.packb(message, default=_pack_vla_eval))
 
     def _hear(self, patience: float) -> tuple[str, dict[str, Any]]:
-        """Return type and payload of the next frame."""
         frame = self._receive(patience)
         kind, payload = (frame.get("type"), frame.get("payload")) if isinstance(frame, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(payload, dict):

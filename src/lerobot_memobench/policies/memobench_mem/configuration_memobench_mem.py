@@ -73,21 +73,21 @@ class Condition(NamedTuple):
     holds: Callable[[MemobenchMemConfig], bool]
 
 
-OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
-PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
-VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
-STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
-MEMORY = Condition("a memory", lambda it: it.memory != NONE)
+OBJECTS = Condition("perception=objects", lambda config: config.uses_objects)
+PICTURES = Condition("a policy that sees pictures", lambda config: config.uses_pictures)
+VISUAL_ENCODER = Condition("size=small perception=pixels", lambda config: config.uses_visual_encoder)
+STATE_TOKEN = Condition("a policy whose state is a token", lambda config: config.state_token)
+MEMORY = Condition("a memory", lambda config: config.memory != NONE)
 OBJECT_MEMORY = Condition(
     "a memory of objects other than motion",
-    lambda it: it.uses_objects and it.memory != NONE and not find_mechanism(it.memory).asks_motion,
+    lambda config: config.uses_objects and config.memory != NONE and not find_mechanism(config.memory).asks_motion,
 )
-TEXT_MEMORY = Condition("a memory that learns from texts", lambda it: it.privileged_memory)
-ALIGNMENT = Condition("an alignment", lambda it: it.align != NONE)
+TEXT_MEMORY = Condition("a memory that learns from texts", lambda config: config.privileged_memory)
+ALIGNMENT = Condition("an alignment", lambda config: config.align != NONE)
 TEXTS = Condition(
-    "an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory
+    "an alignment or a memory that learns from texts", lambda config: config.align != NONE or config.privileged_memory
 )
-FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
+FLOW = Condition("objective=flow_matching", lambda config: config.objective == FLOW_MATCHING)
 
 
 def policy_setting(
@@ -330,7 +330,8 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     def _check_read(self, defaults: Mapping[str, Any]) -> None:
         unset = {
-            one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
+            setting.name: setting.default if setting.default_factory is MISSING else setting.default_factory()
+            for setting in fields(self)
         }
         # Values that a recipe or a checkpoint with another memory, objective, alignment or perception may hold.
         usual = {

@@ -449,11 +449,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ) -> MemobenchMemPolicy:
-        """Load a checkpoint's averaged weights.
-
-        Args:
-            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-        """
+        """Load a checkpoint's averaged weights; without ``dataset_meta`` the policy only acts."""
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
         path = weights_file(source, revision)
@@ -486,7 +482,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return wrapped
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """Return LeRobot's targets for pi0.5."""
         projections = "action_in_proj|action_out_proj"
         targets = rf"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj|model\.({projections}))"
         return {"target_modules": targets, "modules_to_save": self.trained_whole()}

@@ -258,7 +258,7 @@ def _histories(
     unique = {episode: np.unique(np.concatenate(needed[episode])) for episode in sorted(needed)}
     first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
 
-    def places(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
+    def frame_indices(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
         indices = np.full((len(wanted), width), -1)
         for row, (episode, slots) in enumerate(wanted):
             indices[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
@@ -267,8 +267,9 @@ def _histories(
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
     starts = np.repeat([lookup.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
     frames = torch.cat([lookup.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
-    histories = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
-    histories |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
+    longest = max(len(slots) for _, slots in recalled)
+    histories = {FRAMES: frames, STEPS: steps, PLACES: frame_indices(recalled, longest)}
+    histories |= {AHEAD: frame_indices(following, len(ahead[0]))} if len(ahead[0]) else {}
     return histories, steps + torch.from_numpy(starts)
 
 

@@ -41,11 +41,7 @@ def mechanism_names() -> list[str]:
 
 @cache
 def find_mechanism(name: str) -> type[MemoryMechanism]:
-    """Return a mechanism by its name.
-
-    Raises:
-        MemobenchError: the name is unknown or ambiguous, or the package that adds it is broken.
-    """
+    """Return a mechanism; a `MemobenchError` if its name is unknown or ambiguous, or its package is broken."""
     points = [point for point in entry_points(group=GROUP) if point.name == name]
     if name in OURS:
         for point in points:
@@ -93,8 +89,7 @@ def setting_names(name: str) -> set[str]:
 def mechanism_settings(name: str, values: Mapping[str, Any]) -> Any:
     """Return the settings of a mechanism, with defaults for those that ``values`` lacks.
 
-    Raises:
-        MemobenchError: a setting is unknown, or has a wrong type or value.
+    A `MemobenchError` if a setting is unknown, or has a wrong type or value.
     """
     known = setting_names(name)
     for key in values:

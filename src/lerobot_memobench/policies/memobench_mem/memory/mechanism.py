@@ -172,12 +172,7 @@ class MemoryMechanism(nn.Module, ABC):
     capacity: int
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
-        """Build the mechanism.
-
-        Args:
-            pool: maps N stored frames (N, P', D') to tokens (N, P, D). It is trained as a part of the memory.
-            settings: an instance of `Settings`.
-        """
+        """Build it; ``pool`` maps N stored frames (N, P', D') to tokens (N, P, D), and is trained as a part."""
         super().__init__()
         self.spec, self.pool, self.settings = spec, pool, settings
 
@@ -240,9 +235,6 @@ class MemoryMechanism(nn.Module, ABC):
 
         All but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
         episode. Histories must begin at the same frame for all samples of an episode.
-
-        Args:
-            query: the samples' present.
         """
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
@@ -308,10 +300,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the mechanism's own losses by name, (B,) each and weighted; called after `replay` and the actions.
 
         When a loss is only measured, a privileged memory replays the histories with labels, and then without them, so
-        that the actions follow its own choice.
-
-        Args:
-            batch: the training batch, and `MemoryPass.outputs` of its fusion.
+        that the actions follow its own choice. ``batch`` also holds `MemoryPass.outputs` of its fusion.
         """
         return {}
 
