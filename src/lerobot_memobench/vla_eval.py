@@ -255,6 +255,7 @@ class MEMOBench(StepBenchmark):
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Return the action of a real-time tick without an answer: no motion, and the last gripper command."""
         hold = np.zeros(ACTION_DIM, np.float32)
+        # At first the gripper opens.
         hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
         return {"actions": hold}
 

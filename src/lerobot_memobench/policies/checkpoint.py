@@ -21,6 +21,7 @@ from lerobot_memobench.io import read_json as read_json_file
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
+# LeRobot's names of the files in a checkpoint.
 CONFIG_FILE = "config.json"
 TRAIN_CONFIG = "train_config.json"
 WEIGHTS_FILE = "model.safetensors"

@@ -106,7 +106,7 @@ THUMBNAIL = 64
 """Side of a thumbnail, pixels."""
 THUMBNAILS = f"grey-{THUMBNAIL}x{THUMBNAIL}"
 """Identity of thumbnails in feature caches."""
-LUMA = (0.299, 0.587, 0.114)
+LUMA = (0.299, 0.587, 0.114)  # of ITU-R BT.601
 
 
 @torch.no_grad()

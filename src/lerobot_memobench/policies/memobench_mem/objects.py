@@ -49,7 +49,7 @@ FEATURES = 3 * (2 + 2 * len(NEAR_SCALES)) + 2 * FIELDS["rotation"] + FIELDS["joi
 
 def rotation(axis_angle: Tensor) -> Tensor:
     """Return rotation matrices (..., 3, 3) of axes times angles (..., 3), rad (Rodrigues)."""
-    angle = axis_angle.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    angle = axis_angle.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # a zero rotation has no axis
     x, y, z = (axis_angle / angle).unbind(-1)
     none = torch.zeros_like(x)
     cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1).unflatten(-1, (3, 3))
@@ -370,6 +370,7 @@ def in_order(slots: Tensor) -> Tensor:
     """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.fill_slots`: by class and place, empty slots last."""
     kind, position = field(slots, "class").squeeze(-1), field(slots, "position")
     first = torch.where(kind == classes().index("drawer"), -position[..., 2], position[..., 0])  # drawers from the top
+    # Classes are whole numbers, and a place adds less than half of one.
     order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
     rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
     return rows

@@ -23,7 +23,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     State,
 )
 
-PERCEPTUAL_WIDTH, HEADS, BLOCKS = 256, 4, 2
+PERCEPTUAL_WIDTH, HEADS, BLOCKS = 256, 4, 2  # channels as in the source, heads as in one of its releases
 WAVES, TIME_BASE = 128, 10_000.0
 
 

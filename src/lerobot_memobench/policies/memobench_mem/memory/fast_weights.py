@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem.memory.recurrent import (
     projection,
 )
 
-HEADS, FRAMES_READ = 2, 8
+HEADS, FRAMES_READ = 2, 8  # frames 16 control steps apart: a chunk reads the last 128 steps directly
 BASE_RATE, MAX_RATE, MAX_STEP = 0.01, 0.1, 5.0
 """Initial and maximum rate of the inner step, and maximum norm of a head's step."""
 

@@ -178,7 +178,7 @@ class FrameSampling(MemoryMechanism):
 # -- the encoder ------------------------------------------------------------------------------------------------------
 
 
-POSITION_DIM = 768
+POSITION_DIM = 768  # sine and cosine of time, row and column at each frequency
 _FREQUENCIES = 128
 _TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
 

@@ -44,7 +44,7 @@ from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 
 HINDSIGHT, FORESIGHT = 8, 8
 """Number of remembered motions (h) and of predicted motions (n)."""
-FORESIGHT_WEIGHT = 0.01
+FORESIGHT_WEIGHT = 0.01  # HiF-VLA's
 LAYERS, HEADS = 4, 8
 FORESEEN = "memory.foreseen"
 
