@@ -115,10 +115,10 @@ class MEMOBench(StepBenchmark):
             )
         if trained_convention is not None:
             check_choice(STATED, trained_convention, [*CONVENTIONS])
-            if (asked := settings.setdefault("convention", trained_convention)) != trained_convention:
+            if (convention := settings.setdefault("convention", trained_convention)) != trained_convention:
                 raise MemobenchError(
                     f"the model server expects pictures of convention={trained_convention}, and found convention="
-                    f"{asked}; leave it out"
+                    f"{convention}; leave it out"
                 )
         planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
         for name in DECIDED.keys() & settings.keys():
@@ -184,15 +184,15 @@ class MEMOBench(StepBenchmark):
                 f"the model server returned {len(actions)} actions, fewer than n_action_steps={self._n_action_steps}; "
                 f"set n_action_steps to {len(actions)} or less"
             )
-        for each in actions[: self._n_action_steps]:
-            observation, reward, terminated, truncated, info = env.step(each)
+        for command in actions[: self._n_action_steps]:
+            observation, reward, terminated, truncated, info = env.step(command)
             done = terminated or truncated
             self._recorder.record_video(_video_frame(observation))
             self._recorder.record_step(
                 reward=reward,
                 success=info["is_success"],
                 checkpoints_completed=info["checkpoints_completed"],
-                action=each,
+                action=command,
                 state=observation["agent_pos"],
             )
             if done:
@@ -255,6 +255,7 @@ class MEMOBench(StepBenchmark):
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Return the action of a real-time tick without an answer: no motion, and the last gripper command."""
         hold = np.zeros(ACTION_DIM, np.float32)
+        # At first the gripper opens.
         hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
         return {"actions": hold}
 
@@ -276,14 +277,14 @@ class MEMOBench(StepBenchmark):
 
 def _actions(answer: dict[str, Any]) -> NDArray[np.float32]:
     """Return the actions of a model server's answer, (steps, 7)."""
-    given: Any = answer.get("actions", answer.get("action"))
+    values: Any = answer.get("actions", answer.get("action"))
     try:
-        actions = np.array(given, dtype=np.float32, ndmin=2)
+        actions = np.array(values, dtype=np.float32, ndmin=2)
     except (TypeError, ValueError):
         actions = np.empty((0, 0), np.float32)
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
         raise MemobenchError(
-            f"the model server returned actions of shape {np.shape(given)}; expected numbers of shape ({ACTION_DIM},) "
+            f"the model server returned actions of shape {np.shape(values)}; expected numbers of shape ({ACTION_DIM},) "
             f"or (steps, {ACTION_DIM}): end-effector displacement (6) and gripper (1)"
         )
     return actions

@@ -134,10 +134,10 @@ class Behaviour:
         effect = self.memory or float(np.abs(self.alone - np.roll(self.alone, 1, axis=0)).max())
         return max(SHARE * effect, LEAST["float32" if precise else "other"])
 
-    def differ(self, one: Actions, other: Actions) -> int | None:
+    def differ(self, actions: Actions, other: Actions) -> int | None:
         """Return the first call at which actions differ, None if they are equal."""
-        length = min(len(one), len(other))
-        calls = np.flatnonzero(~(np.abs(one[:length] - other[:length]) <= self.tolerance).all(axis=-1))
+        length = min(len(actions), len(other))
+        calls = np.flatnonzero(~(np.abs(actions[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
 
 
@@ -275,11 +275,11 @@ def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
 
 @check("rows are independent")
 def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
-    roll, one = behaviour.subject.roll, behaviour.one
+    roll, stream = behaviour.subject.roll, behaviour.one
     # The other rows begin at other steps.
-    between = roll([behaviour.two, one, behaviour.three])[:, 1]
-    others = roll([behaviour.three, one, behaviour.two])[:, 1]
-    for other, batch in ((others, "with other rows in its batch"), (behaviour.alone, "alone in its batch")):
+    between = roll([behaviour.two, stream, behaviour.three])[:, 1]
+    swapped = roll([behaviour.three, stream, behaviour.two])[:, 1]
+    for other, batch in ((swapped, "with other rows in its batch"), (behaviour.alone, "alone in its batch")):
         call = behaviour.differ(between, other)
         if call is not None:
             return FAILED, f"at call {call} a row acts differently {batch}: {BY_ROW}"

@@ -84,11 +84,11 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
     )
 
 
-def _pictures(rng: np.random.Generator, places: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return a coloured square that moves along places (T, 2) in [-1, 1]."""
-    pictures = np.full((len(places), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+def _pictures(rng: np.random.Generator, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a coloured square that moves along positions (T, 2) in [-1, 1]."""
+    pictures = np.full((len(positions), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
-    corners = ((places + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
+    corners = ((positions + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
     for picture, (top, left) in zip(pictures, corners, strict=True):
         picture[top : top + side, left : left + side] = colour
     return pictures
@@ -100,8 +100,7 @@ class Stream:
 
     Attributes:
         frames: observations by their names at the policy, without a batch dimension.
-        task: the instruction.
-        indices: of the frames in the dataset.
+        task: the instruction. indices: of the frames in the dataset.
     """
 
     frames: tuple[dict[str, Tensor], ...]
@@ -157,7 +156,7 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
             prompted = float(dataset.hf_dataset[first][OBS_PHASE]) != EXECUTION
             episodes.append((not prompted, tuple(indices), episode["tasks"][0]))
     if prompts:
-        episodes.sort(key=lambda one: (one[0], len(one[1])))
+        episodes.sort(key=lambda episode: (episode[0], len(episode[1])))
     for _, indices, task in episodes:
         shown: list[dict[str, Tensor]] = []
         for index in indices:

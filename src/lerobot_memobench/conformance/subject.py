@@ -55,8 +55,7 @@ class Subject:
 
     Attributes:
         dataset: samples as in training, with the policy's delta timestamps.
-        streams: `STREAMS` episodes.
-        cameras: of the dataset.
+        streams: `STREAMS` episodes. cameras: of the dataset.
         numbers: (N,) index in ``dataset`` of each frame of the named dataset.
     """
 
@@ -138,7 +137,6 @@ class EqualNoise(TorchFunctionMode):
     DRAWS = (torch.randn, torch.randn_like, torch.normal, torch.rand, torch.rand_like, Tensor.normal_, Tensor.uniform_)
 
     def __torch_function__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Call a function of torch, and replace the values that it drew."""
         drawn = function(*args, **(kwargs or {}))
         if function in self.DRAWS:
             width = drawn.shape[-1] if drawn.dim() > 1 else 1
@@ -153,28 +151,28 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
         words: ``policy=…``, settings of it, ``dataset=…``, ``obs_type=…``, as ``lerobot train`` takes them.
         folder: empty, for a dataset if none is named.
     """
-    _, obs_type, given = take_training_options(parse_words(words))
+    _, obs_type, user_settings = take_training_options(parse_words(words))
     short = [key for key, fields in SHORT_FORMS["train"].items() if fields[0].startswith("policy.")]
-    for key in given:
+    for key in user_settings:
         if key.partition(".")[0] not in KEYS and key not in short:
             raise MemobenchError(f"memobench conformance has no setting {key!r}, {nearest(key, [*KEYS, *short])}")
-    asked = read_words("train", given)
-    path = asked.get(f"policy.{PATH}")
-    if "dataset" not in given:
-        policy = policy_config(asked)
+    settings = read_words("train", user_settings)
+    path = settings.get(f"policy.{PATH}")
+    if "dataset" not in user_settings:
+        policy = policy_config(settings)
         convention = None if path is None or policy is None else trained_convention(path, policy)[0]
         task = task_of_texts(getattr(policy, "subgoals", None) or {})
-        made = write_streams(folder / "streams", task=task, convention=convention or UPRIGHT)
-        asked = read_words("train", {**given, "dataset": str(made)})
-    check_device(asked.get("policy.device"))
+        dataset = write_streams(folder / "streams", task=task, convention=convention or UPRIGHT)
+        settings = read_words("train", {**user_settings, "dataset": str(dataset)})
+    check_device(settings.get("policy.device"))
     if not torch.cuda.is_available():
-        asked = asked.default("policy.device", "cpu")
-    if setting_kind(asked, "policy.n_action_steps") is not None:
-        asked = asked.default("policy.n_action_steps", REPLAN)
-    config: Any = policy_config(asked)
+        settings = settings.default("policy.device", "cpu")
+    if setting_kind(settings, "policy.n_action_steps") is not None:
+        settings = settings.default("policy.n_action_steps", REPLAN)
+    config: Any = policy_config(settings)
     if config is None:
         raise MemobenchError("name a policy: a checkpoint folder, policy=memobench_strict, or a type (policy=act)")
-    data = str(asked.get("dataset.repo_id")), asked.get("dataset.root")
+    data = str(settings.get("dataset.repo_id")), settings.get("dataset.root")
     errors = []
     for kind in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
         try:

@@ -21,6 +21,7 @@ from lerobot_memobench.io import read_json as read_json_file
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
+# LeRobot's names of the files in a checkpoint.
 CONFIG_FILE = "config.json"
 TRAIN_CONFIG = "train_config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -123,8 +124,8 @@ def checkpoints_of(run: Path) -> list[Path]:
     last = run / CHECKPOINTS / LAST
     numbered = [path for path in last.parent.iterdir() if path.name.isdecimal()] if last.parent.is_dir() else []
     numbered.sort(key=lambda path: int(path.name), reverse=True)
-    named = [last] if last.is_dir() else [path for path in numbered if path.name == text_of_link(last)]
-    return [*named, *numbered]
+    latest = [last] if last.is_dir() else [path for path in numbered if path.name == text_of_link(last)]
+    return [*latest, *numbered]
 
 
 def _through_last(path: Path) -> Path:
@@ -233,7 +234,9 @@ def check_processor_statistics(source: str | Path, revision: str | None = None) 
                         "whole checkpoint or train it again"
                     )
                 known = _shapes(path)
-            missing = [key for key in _normalised(step, name) if not any(one.startswith(f"{key}.") for one in known)]
+            missing = [
+                key for key in _normalised(step, name) if not any(saved.startswith(f"{key}.") for saved in known)
+            ]
             if missing:
                 raise MemobenchError(
                     f"the checkpoint {source} has no normalisation statistics for {', '.join(missing)} "
@@ -271,7 +274,6 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
 
 
 def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
-    """Yield the reasons to refuse a step."""
     name, config = step.get("registry_name"), step.get("config") or {}
     if not isinstance(name, str) or "class" in step:
         yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
@@ -301,7 +303,7 @@ def _registered(name: str, kind: str | None) -> type | None:
 def _trusted(package: str) -> bool:
     from lerobot.configs import PreTrainedConfig
 
-    policies = {one.__module__.partition(".")[0] for one in PreTrainedConfig.get_known_choices().values()}
+    policies = {config.__module__.partition(".")[0] for config in PreTrainedConfig.get_known_choices().values()}
     return package in {*PACKAGES, *policies} or package.startswith(PLUGIN)
 
 
@@ -310,8 +312,8 @@ def _naming(value: Any) -> Iterator[str]:
     if isinstance(value, Mapping):
         yield from (key for key in NAMES_CODE if key in value)
         value = list(value.values())
-    for one in value if isinstance(value, list) else []:
-        yield from _naming(one)
+    for nested in value if isinstance(value, list) else []:
+        yield from _naming(nested)
 
 
 # --- weights and settings ---
@@ -357,18 +359,18 @@ def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str
     The class of its configuration lists them in ``fixed_by_training: ClassVar[tuple[str, ...]]``.
     """
     fixed = getattr(policy, "fixed_by_training", ())
-    for name, asked, held in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
+    for name, value, trained in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
         raise MemobenchError(
-            f"--policy.{name}={asked} cannot be used: '{source}' was trained with {held}, and its weights depend on "
+            f"--policy.{name}={value} cannot be used: '{source}' was trained with {trained}, and its weights depend on "
             f"it; leave {name} out, or train with it"
         )
 
 
-def check_as_begun(checkpoint: str | Path, asked: PreTrainedConfig, begun: PreTrainedConfig) -> None:
+def check_as_begun(checkpoint: str | Path, requested: PreTrainedConfig, begun: PreTrainedConfig) -> None:
     """Refuse to resume a training with other settings."""
-    for name, value, held in differing(asked, begun, getattr(begun, "fixed_by_training", ())):
+    for name, value, earlier in differing(requested, begun, getattr(begun, "fixed_by_training", ())):
         raise MemobenchError(
-            f"this training was begun with {name}={held} and cannot change it; found {value}; "
+            f"this training was begun with {name}={earlier} and cannot change it; found {value}; "
             f"leave {name} out, or train a new run from the checkpoint: policy={checkpoint} policy.{name}={value} "
             "output_dir=<new folder>"
         )
@@ -385,9 +387,9 @@ def differing(
 ) -> Iterator[tuple[str, object, object]]:
     """Yield name, value and earlier value of the settings that differ."""
     for name in names:
-        asked, held = getattr(policy, name), getattr(trained, name)
-        if asked != held:
-            yield name, asked, held
+        value, earlier = getattr(policy, name), getattr(trained, name)
+        if value != earlier:
+            yield name, value, earlier
 
 
 def _shapes(file: Path) -> dict[str, tuple[int, ...]]:

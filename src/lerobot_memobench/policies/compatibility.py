@@ -88,27 +88,27 @@ def check_features(
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
         return
     trained = statistics_shapes(path)
-    there = {renamed.get(name, name): feature for name, feature in shown.items()}
+    available = {renamed.get(name, name): feature for name, feature in shown.items()}
     original = {renamed.get(name, name): name for name in shown}
     _check_cameras(path, cameras_read(policy, trained), original)
     features = {
         OBS_STATE: policy.robot_state_feature,
-        OBS_ENV_STATE: policy.env_state_feature if OBS_ENV_STATE in there else None,  # else see `check_obs_type`
+        OBS_ENV_STATE: policy.env_state_feature if OBS_ENV_STATE in available else None,  # else see `check_obs_type`
         ACTION: policy.action_feature,
     }
     for name, feature in features.items():
         length = None if feature is None else _length(policy, name, feature, trained)
-        if name == OBS_STATE and length is not None and name not in there:
+        if name == OBS_STATE and length is not None and name not in available:
             raise MemobenchError(
                 f"the policy {path} reads {name} ({length} numbers), and the environment has {_list(original)}; map "
                 "its names with --rename_map, or train on a dataset of this environment"
             )
-        if length is not None and there[name].shape != (length,):
+        if length is not None and available[name].shape != (length,):
             raise MemobenchError(
-                f"the policy {path} has {name} of {length} numbers, and the environment has {there[name].shape[0]}; "
-                "train it on a dataset of this environment"
+                f"the policy {path} has {name} of {length} numbers, and the environment has {available[name].shape[0]}"
+                "; train it on a dataset of this environment"
             )
-    _check_sizes(path, policy, there)
+    _check_sizes(path, policy, available)
 
 
 def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
@@ -121,9 +121,9 @@ def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     cameras = list(policy.image_features)
     if not hasattr(policy, "empty_cameras"):
         return cameras
-    named = [name for name in cameras if not name.startswith(EMPTY_CAMERA)]
-    filled = max(0, policy.empty_cameras - (len(cameras) - len(named)))
-    return [name for name in cameras if name in trained] or named[: max(1, len(named) - filled)]
+    real = [name for name in cameras if not name.startswith(EMPTY_CAMERA)]
+    filled = max(0, policy.empty_cameras - (len(cameras) - len(real)))
+    return [name for name in cameras if name in trained] or real[: max(1, len(real) - filled)]
 
 
 def _check_cameras(path: str, cameras: list[str], original: Mapping[str, str]) -> None:
@@ -163,10 +163,10 @@ def keeps_sizes(policy: PreTrainedConfig) -> bool:
     return policy.type in SIZE_COUNTS and (resizes is None or getattr(policy, resizes) is None)
 
 
-def _check_sizes(path: str, policy: PreTrainedConfig, there: Mapping[str, PolicyFeature]) -> None:
+def _check_sizes(path: str, policy: PreTrainedConfig, available: Mapping[str, PolicyFeature]) -> None:
     for name, feature in policy.image_features.items() if keeps_sizes(policy) else ():
-        if name in there and tuple(there[name].shape) != tuple(feature.shape):
-            here, seen = (" x ".join(map(str, shape[1:])) for shape in (there[name].shape, feature.shape))
+        if name in available and tuple(available[name].shape) != tuple(feature.shape):
+            here, seen = (" x ".join(map(str, shape[1:])) for shape in (available[name].shape, feature.shape))
             height, width = feature.shape[1:]
             resizes = SIZE_COUNTS[policy.type]
             also = "" if resizes is None else f", or with --policy.{resizes} for both"
@@ -189,8 +189,8 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
     in_data = {new: old for old, new in trained_names(path).items()}
     cameras = [in_data.get(name, name) for name in cameras_read(policy, statistics_shapes(path))]
     has = {convention: f"{OBS_IMAGES}.{wrist}" in cameras for convention, wrist in WRIST.items()}
-    given = training_of(path).get("dataset") or {}
-    root, name = given.get("root") or "", given.get("repo_id") or ""
+    dataset = training_of(path).get("dataset") or {}
+    root, name = dataset.get("root") or "", dataset.get("repo_id") or ""
     why = f"cameras {', '.join(cameras)}; dataset {name or 'unknown'}"
     if has[MIRRORED]:
         return MIRRORED, why
@@ -204,42 +204,42 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
 
 
 def chosen_convention(
-    path: str | None, policy: Any, asked: str | None, rename_map: Mapping[str, str] | None = None
+    path: str | None, policy: Any, requested: str | None, rename_map: Mapping[str, str] | None = None
 ) -> str | None:
-    """Return the convention of the pictures for a policy: ``asked``, else that of its training.
+    """Return the convention of the pictures for a policy: ``requested``, else that of its training.
 
     None if the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused; so is none
     where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
     mirror pictures.
     """
-    if asked is not None:
-        check_choice("convention", asked, [*WRIST])
+    if requested is not None:
+        check_choice("convention", requested, [*WRIST])
     own: str | None = UPRIGHT
     if getattr(policy, "uses_detector", False):
         why = "its detector reads them"
     elif path is None or not policy.image_features:
-        return asked
+        return requested
     else:
         own, why = trained_convention(path, policy)
     name = path or policy.type
     command = f"lerobot eval env=memobench policy={name} convention="
-    if own is None and asked is None:
+    if own is None and requested is None:
         raise MemobenchError(
             f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
     mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
-    for other in (asked, *mapped):
+    for other in (requested, *mapped):
         if own is not None and other not in (None, own):
-            where = "" if other == asked else " in rename_map, which does not mirror pictures"
+            where = "" if other == requested else " in rename_map, which does not mirror pictures"
             raise MemobenchError(
                 f"the policy {name} expects pictures of convention={own} ({why}), and found {other}{where}; run "
                 f"`{command}{own}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
                 f"--env.convention={own}`"
             )
-    if asked is None and own != UPRIGHT:
+    if requested is None and own != UPRIGHT:
         logger.warning("pictures have convention=%s, as in the training of %s (%s)", own, name, why)
-    return asked or own
+    return requested or own
 
 
 # --- the clock of observations ---

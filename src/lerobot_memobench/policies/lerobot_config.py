@@ -65,8 +65,8 @@ def check_sizes(policy: Any) -> None:
 def _integers(value: Any, name: str = "") -> Iterator[tuple[str, int]]:
     """Yield dotted name and value of the whole numbers in an encoded configuration."""
     if isinstance(value, dict | list):
-        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _integers(one, f"{name}.{key}".lstrip("."))
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _integers(item, f"{name}.{key}".lstrip("."))
     elif isinstance(value, int):
         yield name, value
 
@@ -77,11 +77,11 @@ def has_device(device: str) -> bool:
     from lerobot.utils.device_utils import is_torch_device_available
 
     try:
-        asked = torch.device(device)
-        available = is_torch_device_available(asked.type)
+        torch_device = torch.device(device)
+        available = is_torch_device_available(torch_device.type)
     except (RuntimeError, ValueError):  # there is no such type
         return False
-    return available and (asked.type != "cuda" or (asked.index or 0) < torch.cuda.device_count())
+    return available and (torch_device.type != "cuda" or (torch_device.index or 0) < torch.cuda.device_count())
 
 
 def check_device(device: str | None) -> None:
@@ -97,13 +97,7 @@ def check_device(device: str | None) -> None:
 
 
 def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
-    """Return the description of a policy for the evaluation's file.
-
-    Args:
-        policy: its configuration.
-        path: its checkpoint; None for a policy without one.
-        settings: settings of its environments.
-    """
+    """Return the description of a policy (its configuration, and its checkpoint or None) for the evaluation's file."""
     inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
     weights = None if path is None else checkpoint_hash(path)
     hashed = {"sha256": weights} if path is not None and Path(path).is_dir() else {}

@@ -104,10 +104,7 @@ def noting_reads(
 ) -> Iterator[Callable[[NDArray[np.bool_]], None]]:
     """Watch a batch of rollouts; the yielded function writes the reads of finished episodes, a mask (rows,).
 
-    Episodes that were already in the log are not planned and keep their files.
-
-    Args:
-        folder: of the episode log. settings: of the environments. seeds: of the rows.
+    ``folder`` is that of the log. Episodes already in it are not planned and keep their files.
     """
     policy.watch_memory()
     written = np.zeros(len(seeds), bool)

@@ -148,8 +148,8 @@ class RemoteConfig(UntrainedConfig):
 
     def addresses(self) -> list[str]:
         """Return the addresses of the servers, ``scheme://host:port``, or refuse an invalid one."""
-        given = self.servers.split(",") if self.servers else [f"{self.host}:{self.port or self.connection.port}"]
-        return [_address(text.strip()) for text in given]
+        texts = self.servers.split(",") if self.servers else [f"{self.host}:{self.port or self.connection.port}"]
+        return [_address(text.strip()) for text in texts]
 
     def sent(self) -> dict[str, str]:
         """Return the server's name -> our name of each sent observation, or refuse ``keys`` that are no pairs."""
@@ -233,8 +233,8 @@ class RemotePolicy(UntrainedPolicy):
             self._add_client()
         batch = _flat(batch)
         observations = [EnvObservation(batch, index, self._cameras) for index in range(count)]
-        each = map if count == 1 else self._pool.map
-        return torch.from_numpy(np.stack([*each(Client.act, self._clients, observations)]))
+        run = map if count == 1 else self._pool.map
+        return torch.from_numpy(np.stack([*run(Client.act, self._clients, observations)]))
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
@@ -323,7 +323,6 @@ class Client:
         return self._config.send_prompt and step % self._config.prompt_stride == 0
 
     def _frame(self, observation: EnvObservation) -> NamedValues:
-        """Return the observations that are sent, by our names."""
         buffered = (IMAGE, STATE) if self._config.connection.buffers else ()
         values = {name: observation.get(name) for name in (*buffered, *self._connection.keys.values())}
         if observation.scalar(STEP) is not None:
@@ -382,7 +381,7 @@ class EnvObservation:
     @property
     def convention(self) -> str | None:
         """The convention of the pictures by the name of the wrist camera, None if it is unknown."""
-        return next((one for one, name in WRIST.items() if f"{OBS_IMAGES}.{name}" in self.batch), None)
+        return next((convention for convention, name in WRIST.items() if f"{OBS_IMAGES}.{name}" in self.batch), None)
 
     @property
     def blank(self) -> bool:
@@ -409,7 +408,11 @@ class EnvObservation:
 def _flat(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return a batch whose parts of ``robot_state`` have names with dots, such as ``robot_state.joints.pos``."""
     nested = f"{OBS_STR}.robot_state"
-    parts = {f"{nested}.{group}.{key}": one for group, of in batch.get(nested, {}).items() for key, one in of.items()}
+    parts = {
+        f"{nested}.{group}.{key}": value
+        for group, values in batch.get(nested, {}).items()
+        for key, value in values.items()
+    }
     return {name: value for name, value in batch.items() if name != nested} | parts
 
 

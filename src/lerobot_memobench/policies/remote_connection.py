@@ -152,11 +152,7 @@ class Connection:
         return metadata if isinstance(metadata, dict) else {}
 
     def ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Send a message and return the answer.
-
-        Raises:
-            MemobenchError: the server failed, disconnected, took too long, or has another protocol.
-        """
+        """Return the answer; a `MemobenchError` if the server fails, is too slow or has another protocol."""
         try:
             answer = self._exchange(question)
         except TimeoutError as error:
@@ -353,7 +349,7 @@ class VlaEvalConnection(Connection):
                 payload[theirs] = _as_png(frame[ours])
         frames, self._frames = self._frames, []
         if frames and frames[0]:
-            payload |= {HISTORY[name]: [each[name] for each in frames] for name in frames[0]}
+            payload |= {HISTORY[name]: [past[name] for past in frames] for name in frames[0]}
             payload["episode_restart"] = True
         return self.ask({"type": "observation", "payload": payload})
 
@@ -368,11 +364,11 @@ class VlaEvalConnection(Connection):
                 f"the policy server at {self.address} has version {version} of {self.protocol}; expected version "
                 f"{PROTOCOL}: serve the policy with vla-eval {VERSION}"
             )
-        if not self._warned and (others := _other_formats(payload)):
-            logger.warning("the policy server at %s works with %s", self.address, "; ".join(others))
+        if not self._warned and (formats := _other_formats(payload)):
+            logger.warning("the policy server at %s works with %s", self.address, "; ".join(formats))
         self._warned = True
-        asked = payload.get("observation_params")
-        stated = {STATED: asked[STATED]} if isinstance(asked, dict) and STATED in asked else {}
+        params = payload.get("observation_params")
+        stated = {STATED: params[STATED]} if isinstance(params, dict) and STATED in params else {}
         return stated | {name: payload[name] for name in ("model_server", "harness_version") if name in payload}
 
     def _exchange(self, question: dict[str, Any]) -> dict[str, Any]:
@@ -391,7 +387,6 @@ class VlaEvalConnection(Connection):
         self._send(msgpack.packb(message, default=_pack_vla_eval))
 
     def _hear(self, patience: float) -> tuple[str, dict[str, Any]]:
-        """Return type and payload of the next frame."""
         frame = self._receive(patience)
         kind, payload = (frame.get("type"), frame.get("payload")) if isinstance(frame, dict) else (None, None)
         if not isinstance(kind, str) or not isinstance(payload, dict):

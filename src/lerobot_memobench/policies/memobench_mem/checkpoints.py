@@ -48,9 +48,9 @@ def read_config(source: str | Path, config: PreTrainedConfig | None, revision: s
 def has_another_memory(config: MemobenchMemConfig, trained: MemobenchMemConfig) -> bool:
     """Return whether a policy's memory differs from its checkpoint's in more than the number of frames read."""
 
-    def memory(one: MemobenchMemConfig) -> tuple[Any, ...]:
-        settings = {name: value for name, value in one.memory_settings.items() if name != "frames"}
-        return one.memory, settings, one.memory_fusion, one.subgoals
+    def memory(policy: MemobenchMemConfig) -> tuple[Any, ...]:
+        settings = {name: value for name, value in policy.memory_settings.items() if name != "frames"}
+        return policy.memory, settings, policy.memory_fusion, policy.subgoals
 
     return memory(config) != memory(trained)
 
@@ -74,10 +74,10 @@ def _head(policy: nn.Module) -> set[str]:
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
     """Load the weights of checkpoint ``source``; `restarted` parts keep their initial weights, with a warning."""
     config, new = cast(MemobenchMemConfig, policy.config), restarted(policy, trained)
-    for name, asked, held in differing(config, trained, ("base_weights", "visual_encoder")):
+    for name, value, earlier in differing(config, trained, ("base_weights", "visual_encoder")):
         raise MemobenchError(
-            f"--policy.{name}={asked} has no effect: it sets initial weights, and the weights of '{source}' "
-            f"({name}={held}) replace them; leave {name} out, or train from scratch."
+            f"--policy.{name}={value} has no effect: it sets initial weights, and the weights of '{source}' "
+            f"({name}={earlier}) replace them; leave {name} out, or train from scratch."
         )
     if has_another_memory(config, trained):
         logger.warning(
@@ -97,7 +97,9 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
 def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str) -> None:
     """Load pi0.5's weights; the memory's parameters keep their initial values."""
     # As LeRobot's pi0.5: openpi's checkpoints have older names, and store the embedding as the language head only.
-    placed = {name.removeprefix("model.").replace("action_time_mlp", "time_mlp"): one for name, one in weights.items()}
+    placed = {
+        name.removeprefix("model.").replace("action_time_mlp", "time_mlp"): tensor for name, tensor in weights.items()
+    }
     if _HEAD in placed:
         placed.setdefault(_EMBEDDING, placed[_HEAD])
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
@@ -107,11 +109,7 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
 
 
 def weights_file(source: str | Path, revision: str | None = None) -> Path:
-    """Return the file of a checkpoint's weights.
-
-    Raises:
-        MemobenchError: the checkpoint has no weights.
-    """
+    """Return the file of a checkpoint's weights; a `MemobenchError` without one."""
     path = checkpoint_file(source, WEIGHTS_FILE, revision)
     if path is None:
         raise MemobenchError(f"The checkpoint '{source}' has no {WEIGHTS_FILE}; give a pretrained_model folder.")
@@ -137,11 +135,7 @@ def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:
-    """Load ``weights`` into ``module``; names in ``optional`` may be missing.
-
-    Raises:
-        MemobenchError: names are missing, or shapes differ.
-    """
+    """Load ``weights``; a `MemobenchError` if names not in ``optional`` are missing, or shapes differ."""
     own = module.state_dict()
     missing = sorted(set(own) - set(weights) - optional)
     wrong = sorted(name for name in set(own) & set(weights) if own[name].shape != weights[name].shape)
@@ -159,27 +153,24 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Pa
 
 
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
-    """Check that the saved processor steps of a checkpoint agree with ``config``.
+    """Raise `MemobenchError` if the saved processor steps of a checkpoint disagree with ``config``.
 
     Training updates most steps (`follow_training`); a pretrained tokenizer keeps the checkpoint's settings. A
     checkpoint without a preprocessor passes this check; LeRobot reports it.
-
-    Raises:
-        MemobenchError: a setting would have no effect.
     """
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
     if path is None:
         return
     steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in processor_steps(path)}
-    tokenizer, held = steps.get("memobench_tokenizer"), dict[str, Any]()
+    tokenizer, saved = steps.get("memobench_tokenizer"), dict[str, Any]()
     if not training:
-        held["oracle_memory"] = steps.get("memobench_oracle_memory", {}).get("enabled", False)
+        saved["oracle_memory"] = steps.get("memobench_oracle_memory", {}).get("enabled", False)
     elif tokenizer is None:
-        held["tokenizer_name"] = "words"
+        saved["tokenizer_name"] = "words"
     else:
-        held["tokenizer_name"] = tokenizer.get("tokenizer_name")
-        held["tokenizer_max_length"] = tokenizer.get("max_length")
-    for field, value in held.items():
+        saved["tokenizer_name"] = tokenizer.get("tokenizer_name")
+        saved["tokenizer_max_length"] = tokenizer.get("max_length")
+    for field, value in saved.items():
         if getattr(config, field) != value:
             raise MemobenchError(
                 f"--policy.{field}={getattr(config, field)} has no effect: the preprocessor of '{source}' was saved "

@@ -73,21 +73,21 @@ class Condition(NamedTuple):
     holds: Callable[[MemobenchMemConfig], bool]
 
 
-OBJECTS = Condition("perception=objects", lambda it: it.uses_objects)
-PICTURES = Condition("a policy that sees pictures", lambda it: it.uses_pictures)
-VISUAL_ENCODER = Condition("size=small perception=pixels", lambda it: it.uses_visual_encoder)
-STATE_TOKEN = Condition("a policy whose state is a token", lambda it: it.state_token)
-MEMORY = Condition("a memory", lambda it: it.memory != NONE)
+OBJECTS = Condition("perception=objects", lambda config: config.uses_objects)
+PICTURES = Condition("a policy that sees pictures", lambda config: config.uses_pictures)
+VISUAL_ENCODER = Condition("size=small perception=pixels", lambda config: config.uses_visual_encoder)
+STATE_TOKEN = Condition("a policy whose state is a token", lambda config: config.state_token)
+MEMORY = Condition("a memory", lambda config: config.memory != NONE)
 OBJECT_MEMORY = Condition(
     "a memory of objects other than motion",
-    lambda it: it.uses_objects and it.memory != NONE and not find_mechanism(it.memory).asks_motion,
+    lambda config: config.uses_objects and config.memory != NONE and not find_mechanism(config.memory).asks_motion,
 )
-TEXT_MEMORY = Condition("a memory that learns from texts", lambda it: it.privileged_memory)
-ALIGNMENT = Condition("an alignment", lambda it: it.align != NONE)
+TEXT_MEMORY = Condition("a memory that learns from texts", lambda config: config.privileged_memory)
+ALIGNMENT = Condition("an alignment", lambda config: config.align != NONE)
 TEXTS = Condition(
-    "an alignment or a memory that learns from texts", lambda it: it.align != NONE or it.privileged_memory
+    "an alignment or a memory that learns from texts", lambda config: config.align != NONE or config.privileged_memory
 )
-FLOW = Condition("objective=flow_matching", lambda it: it.objective == FLOW_MATCHING)
+FLOW = Condition("objective=flow_matching", lambda config: config.objective == FLOW_MATCHING)
 
 
 def policy_setting(
@@ -330,7 +330,8 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     def _check_read(self, defaults: Mapping[str, Any]) -> None:
         unset = {
-            one.name: one.default if one.default_factory is MISSING else one.default_factory() for one in fields(self)
+            setting.name: setting.default if setting.default_factory is MISSING else setting.default_factory()
+            for setting in fields(self)
         }
         # Values that a recipe or a checkpoint with another memory, objective, alignment or perception may hold.
         usual = {
@@ -348,14 +349,14 @@ class MemobenchMemConfig(PreTrainedConfig):
             raise UnreadError(
                 f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
                 f"out, or set it to its default, {json.dumps(unset[name])}.",
-                {one: unset[one] for one in unread},
+                {field_name: unset[field_name] for field_name in unread},
             )
         if self.memory == NONE:
             self.memory_fusion = None
 
     def _complete_memory(self) -> None:
         if self.memory == NONE:
-            if self.memory_settings in [asdict(mechanism_settings(one, {})) for one in OURS if self.memory_settings]:
+            if self.memory_settings in [asdict(mechanism_settings(name, {})) for name in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
             return
         mechanism = find_mechanism(self.memory)
@@ -379,20 +380,20 @@ class MemobenchMemConfig(PreTrainedConfig):
     # -- checks ----------------------------------------------------------------------------------------------------
 
     def _check_values(self) -> None:
-        for one in fields(self):
-            known, given = one.metadata.get("values"), getattr(self, one.name)
-            if known and given not in known and not (given is None and one.default is FROM_SIZE):
+        for setting in fields(self):
+            known, value = setting.metadata.get("values"), getattr(self, setting.name)
+            if known and value not in known and not (value is None and setting.default is FROM_SIZE):
                 raise MemobenchError(
-                    f"memobench_mem has no {one.name} '{given}': {nearest(str(given), known)} "
-                    f"Pass --policy.{one.name}=<one of {', '.join(known)}>."
+                    f"memobench_mem has no {setting.name} '{value}': {nearest(str(value), known)} "
+                    f"Pass --policy.{setting.name}=<one of {', '.join(known)}>."
                 )
 
     def _check_numbers(self) -> None:
-        for one in fields(self):
-            least, most = one.metadata.get("least", -math.inf), one.metadata.get("most", math.inf)
-            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, one.name) <= most:  # nor NaN
+        for setting in fields(self):
+            least, most = setting.metadata.get("least", -math.inf), setting.metadata.get("most", math.inf)
+            if (least, most) != (-math.inf, math.inf) and not least <= getattr(self, setting.name) <= most:  # nor NaN
                 raise MemobenchError(
-                    f"--policy.{one.name}={getattr(self, one.name)} is out of range; expected at least {least}"
+                    f"--policy.{setting.name}={getattr(self, setting.name)} is out of range; expected at least {least}"
                     + ("." if most == math.inf else f" and {'at most' if isinstance(most, int) else 'below'} 1.")
                 )
         if self.n_action_steps > self.chunk_size:
@@ -429,8 +430,8 @@ class MemobenchMemConfig(PreTrainedConfig):
     def fixed_by_training(self) -> tuple[str, ...]:
         """Fields that must keep their values when a checkpoint acts or its training is resumed."""
         # Ours first, because another setting is the cause of other inputs.
-        inherited = [one.name for one in fields(PreTrainedConfig)]
-        names = [one.name for one in fields(self) if one.name not in MAY_DIFFER]
+        inherited = [setting.name for setting in fields(PreTrainedConfig)]
+        names = [setting.name for setting in fields(self) if setting.name not in MAY_DIFFER]
         return tuple(sorted(names, key=inherited.__contains__))
 
     @property
@@ -546,7 +547,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     def validate_features(self) -> None:
         """Remove features that this perception does not read; with a detector, add its cameras."""
         unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
-        for key in [key for key, one in self.input_features.items() if one.type is unseen or key in CLOCK]:
+        for key in [key for key, feature in self.input_features.items() if feature.type is unseen or key in CLOCK]:
             del self.input_features[key]
         if self.uses_detector and not self.image_features:
             shape = (3, IMAGE_SIZE, IMAGE_SIZE)
@@ -590,7 +591,7 @@ class MemobenchMemConfig(PreTrainedConfig):
 
 def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
     """Return the conditions of the fields of a configuration that are not always used."""
-    return {one.name: one.metadata["used_if"] for one in fields(config) if one.metadata.get("used_if")}
+    return {setting.name: setting.metadata["used_if"] for setting in fields(config) if setting.metadata.get("used_if")}
 
 
 def memory_defaults() -> dict[str, Any]:
@@ -598,6 +599,6 @@ def memory_defaults() -> dict[str, Any]:
 
     ``memory_settings`` are not among them: construction converts them.
     """
-    own = {one.name: one.default for one in fields(MemobenchMemConfig)}
+    own = {setting.name: setting.default for setting in fields(MemobenchMemConfig)}
     of_memory = [name for name, condition in conditions().items() if condition in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
     return {name: own[name] for name in of_memory if name != "memory_settings"}

@@ -106,7 +106,7 @@ THUMBNAIL = 64
 """Side of a thumbnail, pixels."""
 THUMBNAILS = f"grey-{THUMBNAIL}x{THUMBNAIL}"
 """Identity of thumbnails in feature caches."""
-LUMA = (0.299, 0.587, 0.114)
+LUMA = (0.299, 0.587, 0.114)  # of ITU-R BT.601
 
 
 @torch.no_grad()
@@ -215,8 +215,8 @@ class PixelPool(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Return tokens (N, 16, width) of pooled ones (N, 16, WIDTH)."""
-        made = self.project(frames.to(self.project.weight.dtype))
-        return rms_norm(made, made.shape[-1:], eps=1e-6)
+        tokens = self.project(frames.to(self.project.weight.dtype))
+        return rms_norm(tokens, tokens.shape[-1:], eps=1e-6)
 
 
 class VisualTokenEncoder(nn.Module, ObservationEncoder):
@@ -297,8 +297,8 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
 
     def prefix(self, observed: Tensor) -> Tensor:
         """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
-        made: Tensor = self.project(observed.to(self.project.weight.dtype))
-        return made * TOKEN_SCALE
+        tokens: Tensor = self.project(observed.to(self.project.weight.dtype))
+        return tokens * TOKEN_SCALE
 
     def pool(self) -> nn.Module:
         """Return a trained projection of each frame's tokens."""

@@ -58,6 +58,7 @@ def rotate(x: Tensor, rotations: Tensor) -> Tensor:
 
 def hidden(real: Tensor) -> Tensor:
     """Return the bias of attention scores: 0 for tokens that are read (``real``), very low for all others."""
+    # Half of the minimum stays finite when a score is added to it.
     return torch.where(real, 0.0, torch.finfo(torch.float32).min / 2)
 
 

@@ -265,7 +265,7 @@ def alignment_loss(
         # Cheap, and comparable with the gradient norm that LeRobot logs.
         gradients = torch.autograd.grad(weighted, list(encoder), retain_graph=True, materialize_grads=True)
         # The gradient of a rank is that of its own rows; DDP averages them.
-        logged["align_grad_norm"] = mean_over_ranks(torch.cat([each.reshape(-1) for each in gradients])).norm().item()
+        logged["align_grad_norm"] = mean_over_ranks(torch.cat([grad.reshape(-1) for grad in gradients])).norm().item()
     with torch.no_grad():
         logged["align_top1"] = retrieval_accuracy(*map(joint, alignment.pairs(*usable)))
     return weighted, logged | alignment.numbers()

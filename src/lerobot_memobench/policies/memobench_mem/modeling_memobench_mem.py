@@ -449,11 +449,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         dataset_meta: Any | None = None,
         **kwargs: Any,
     ) -> MemobenchMemPolicy:
-        """Load a checkpoint's averaged weights.
-
-        Args:
-            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-        """
+        """Load a checkpoint's averaged weights; without ``dataset_meta`` the policy only acts."""
         source = pretrained_name_or_path
         config = read_config(source, config, revision)
         path = weights_file(source, revision)
@@ -486,7 +482,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return wrapped
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
-        """Return LeRobot's targets for pi0.5."""
         projections = "action_in_proj|action_out_proj"
         targets = rf"(.*\.gemma_expert\..*\.self_attn\.(q|v)_proj|model\.({projections}))"
         return {"target_modules": targets, "modules_to_save": self.trained_whole()}
@@ -497,12 +492,12 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             overrides["modules_to_save"] = self.trained_whole(overrides["modules_to_save"])
         return overrides
 
-    def trained_whole(self, asked: Iterable[str] = ()) -> list[str]:
-        """Return peft's ``modules_to_save``: the modules ``asked`` for, and the model's memory and heads."""
+    def trained_whole(self, requested: Iterable[str] = ()) -> list[str]:
+        """Return peft's ``modules_to_save``: the ``requested`` modules, and the model's memory and heads."""
         names = [name for name, _ in self.named_modules()]
         own = [end for end in OWN_MODULES if any(name == end or name.endswith(f".{end}") for name in names)]
         own += [name for name in names if name.removeprefix("model.modulators.").isdecimal()]  # peft takes no list
-        return [*asked, *(end for end in own if end not in set(asked))]
+        return [*requested, *(end for end in own if end not in set(requested))]
 
 
 def _without_labels(batch: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -164,15 +164,15 @@ class MemoryPI05(nn.Module):
         real, collected = prefix.real, memory.attention.get("prefix")
         turned = rotary(torch.cumsum(real, dim=1) - 1, model.rotary_emb.inv_freq)
         seen = real[:, None] if prefix.attends is None else prefix.attends & real[:, None]
-        x, kept, last = _narrowed(prefix.tokens, model), [], len(model.layers) - 1
+        x, cache, last = _narrowed(prefix.tokens, model), [], len(model.layers) - 1
         for number, layer in enumerate(model.layers):
             asked = slice(None) if number < last or collected is not None else prefix.asked
             x, *keys = self._call_layer(_prefix_layer, layer, x, turned, hidden(seen), asked, collected)
-            kept.append((keys[0][:, prefix.unread :], keys[1][:, prefix.unread :]))
+            cache.append((keys[0][:, prefix.unread :], keys[1][:, prefix.unread :]))
         if prefix.asked is not None:
             states = rms_norm(x[:, prefix.asked] if collected is not None else x)
             memory.read_out(states * (1.0 + model.norm.weight.float()))
-        return PrefixKeys(kept, hidden(real[:, None, prefix.unread :]), real.sum(dim=1, keepdim=True))
+        return PrefixKeys(cache, hidden(real[:, None, prefix.unread :]), real.sum(dim=1, keepdim=True))
 
     def modulations(self, time: Tensor, instruction: Tensor | None, memory: MemoryPass) -> list[Tensor]:
         """Return scale, shift and gate of each norm of the expert (..., B, 1, 3 W) at times (..., B) of denoising."""
@@ -188,8 +188,8 @@ class MemoryPI05(nn.Module):
         """Return the velocity (B, T, A) of noisy actions (B, T, A), float32, given the `modulations` of the norms."""
         model = self.paligemma_with_expert.gemma_expert.model
         states = _narrowed(memory.actions(self.action_in_proj(x)), model)
-        places = past.length + torch.arange(states.shape[1], device=states.device)
-        turned = rotary(places, self.paligemma_with_expert.paligemma.model.language_model.rotary_emb.inv_freq)
+        positions = past.length + torch.arange(states.shape[1], device=states.device)
+        turned = rotary(positions, self.paligemma_with_expert.paligemma.model.language_model.rotary_emb.inv_freq)
         bias, norms = F.pad(past.bias, (0, states.shape[1])), iter(modulations)
         for number, (layer, keys) in enumerate(zip(model.layers, past.keys, strict=True)):
             both = next(norms), next(norms)
@@ -199,10 +199,10 @@ class MemoryPI05(nn.Module):
         velocity: Tensor = self.action_out_proj(states[:, -self.config.chunk_size :].to(torch.float32))
         return velocity
 
-    def _call_layer(self, layer: Callable[..., Any], *given: Any) -> Any:
+    def _call_layer(self, layer: Callable[..., Any], *inputs: Any) -> Any:
         if self.gradient_checkpointing_enabled and self.training:
-            return checkpoint(layer, *given, use_reentrant=False, preserve_rng_state=False)
-        return layer(*given)
+            return checkpoint(layer, *inputs, use_reentrant=False, preserve_rng_state=False)
+        return layer(*inputs)
 
     def forward(
         self, seen: Observation, actions: Tensor, noise: Tensor, time: Tensor, memory: MemoryPass | None = None
@@ -223,8 +223,8 @@ class MemoryPI05(nn.Module):
         past = self.read_prefix(prefix, memory)
         times = 1.0 - torch.arange(steps, dtype=torch.float32, device=noise.device) / steps
         times = times[:, None].expand(-1, len(noise))
-        each: Any = zip(*self.modulations(times, prefix.instruction, memory), strict=True)
-        return euler_integrate(lambda x, time: self.velocity(x, next(each), past, memory), noise, steps)
+        modulations: Any = zip(*self.modulations(times, prefix.instruction, memory), strict=True)
+        return euler_integrate(lambda x, time: self.velocity(x, next(modulations), past, memory), noise, steps)
 
     # -- parameters --------------------------------------------------------------------------------------------------
 
@@ -236,7 +236,7 @@ class MemoryPI05(nn.Module):
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return the parameters that plain pi0.5 does not have, by name."""
         memory = self.memory_names()
-        return {name: one for name, one in self.named_parameters() if name.startswith(OWN) or name in memory}
+        return {name: tensor for name, tensor in self.named_parameters() if name.startswith(OWN) or name in memory}
 
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
@@ -399,8 +399,8 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     for module in (tower.multi_modal_projector, backbone.paligemma.lm_head, backbone.gemma_expert.lm_head):
         module.requires_grad_(False)
     backbone.perception = _perception(config, tower)
-    made: PaliGemmaWithExpertModel = backbone
-    return made
+    typed: PaliGemmaWithExpertModel = backbone
+    return typed
 
 
 def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:

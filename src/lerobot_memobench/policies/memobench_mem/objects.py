@@ -49,7 +49,7 @@ FEATURES = 3 * (2 + 2 * len(NEAR_SCALES)) + 2 * FIELDS["rotation"] + FIELDS["joi
 
 def rotation(axis_angle: Tensor) -> Tensor:
     """Return rotation matrices (..., 3, 3) of axes times angles (..., 3), rad (Rodrigues)."""
-    angle = axis_angle.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    angle = axis_angle.norm(dim=-1, keepdim=True).clamp(min=1e-6)  # a zero rotation has no axis
     x, y, z = (axis_angle / angle).unbind(-1)
     none = torch.zeros_like(x)
     cross = torch.stack([none, -z, y, z, none, -x, -y, x, none], dim=-1).unflatten(-1, (3, 3))
@@ -59,16 +59,16 @@ def rotation(axis_angle: Tensor) -> Tensor:
 
 def slot_features(slots: Tensor, hand: Tensor) -> Tensor:
     """Return features (M, FEATURES), scaled to about one, of things (M, WIDTH) given the hand's pose (M, 6)."""
-    place, axes = field(slots, "position"), field(slots, "rotation").unflatten(-1, (2, 3))
+    position, axes = field(slots, "position"), field(slots, "rotation").unflatten(-1, (2, 3))
     turned = rotation(hand[:, 3:HAND_DIM])
-    offset = place - hand[:, :3]
+    offset = position - hand[:, :3]
     # A row vector times the hand's matrix is that vector in the hand's frame.
     from_hand = (offset.unsqueeze(1) @ turned).squeeze(1)
     near = [torch.tanh(vector / scale) for vector in (offset, from_hand) for scale in NEAR_SCALES]
-    middle = torch.tensor(WORKSPACE_CENTRE, device=place.device)
-    places = [(place - middle) * PER_METRE, offset * PER_METRE, *near]
+    middle = torch.tensor(WORKSPACE_CENTRE, device=position.device)
+    vectors = [(position - middle) * PER_METRE, offset * PER_METRE, *near]
     rest = [field(slots, "joint") * PER_METRE, field(slots, "highlighted")]
-    return torch.cat([*places, axes.flatten(1), (axes @ turned).flatten(1), *rest], dim=-1)
+    return torch.cat([*vectors, axes.flatten(1), (axes @ turned).flatten(1), *rest], dim=-1)
 
 
 class SlotEncoder(nn.Module):
@@ -87,14 +87,14 @@ class SlotEncoder(nn.Module):
 
     def forward(self, slots: Tensor, hand: Tensor) -> tuple[Tensor, Tensor]:
         """Return vectors (M, width) of things in slots (N, SLOTS, WIDTH) given hands (N, 6), and their slots (bool)."""
-        there = field(slots, "present").squeeze(-1) > 0
-        things, hands = slots[there], hand.unsqueeze(1).expand(-1, slots.shape[1], -1)[there]
+        present = field(slots, "present").squeeze(-1) > 0
+        things, hands = slots[present], hand.unsqueeze(1).expand(-1, slots.shape[1], -1)[present]
         with torch.autocast(slots.device.type, enabled=False):  # bfloat16 rounds places to 4 mm
             features = slot_features(things, hands)
         order = torch.tensor(self.order, device=slots.device)
         kinds = order[field(things, "class").squeeze(-1).long()]
-        made: Tensor = self.mlp(torch.cat([features, self.kind(kinds)], dim=-1))
-        return made, there
+        vectors: Tensor = self.mlp(torch.cat([features, self.kind(kinds)], dim=-1))
+        return vectors, present
 
 
 # -- object state -----------------------------------------------------------------------------------------------------
@@ -109,10 +109,10 @@ def frame_row(slots: Tensor, state: Tensor, phase: Tensor) -> Tensor:
     return rearrange(row, "n d -> n 1 d")
 
 
-def in_slots(made: Tensor, there: Tensor, empty: float = 0.0) -> Tensor:
-    """Return the vectors of things (M, D) in their slots (N, SLOTS, D), which ``there`` (N, SLOTS) marks."""
-    slots = made.new_full((*there.shape, made.shape[-1]), empty)
-    slots[there] = made  # masked_scatter takes three times as long
+def in_slots(vectors: Tensor, present: Tensor, empty: float = 0.0) -> Tensor:
+    """Return the vectors of things (M, D) in their slots (N, SLOTS, D), which ``present`` (N, SLOTS) marks."""
+    slots = vectors.new_full((*present.shape, vectors.shape[-1]), empty)
+    slots[present] = vectors  # masked_scatter takes three times as long
     return slots
 
 
@@ -133,15 +133,15 @@ class ObjectPool(nn.Module):
     def forward(self, frames: Tensor) -> Tensor:
         """Return tokens (N, tokens, width) of frames (N, 1, SIZE + 6 + 1)."""
         slots, hand, phase = frames.flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
-        made, there = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
-        score = self.score(made)
+        vectors, present = self.slot(slots.unflatten(1, (SLOTS, WIDTH)), hand)
+        score = self.score(vectors)
         # A finite score keeps a frame without objects finite; its pooled values are zeros.
-        scores, values = in_slots(score, there, -1e4), in_slots(made, there)
+        scores, values = in_slots(score, present, -1e4), in_slots(vectors, present)
         pooled = torch.einsum("nsk,nsd->nkd", scores.softmax(dim=1), values)
         if self.phase is not None:
             pooled = pooled + self.phase(phase).unsqueeze(1)
-        kept: Tensor = self.out(pooled)
-        return rms_norm(kept, kept.shape[-1:], eps=1e-6)
+        tokens: Tensor = self.out(pooled)
+        return rms_norm(tokens, tokens.shape[-1:], eps=1e-6)
 
     def phases(self, frames: Tensor) -> Tensor:
         """Return tokens of frames without objects and hand, which hold only the phase."""
@@ -206,8 +206,8 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
     def prefix(self, observed: Tensor) -> Tensor:
         """Return a token (B, n, d_vlm) per slot of `present`; zeros for empty slots."""
         slots, hand = observed[:, :-HAND_DIM], observed[:, -HAND_DIM:]
-        made, there = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
-        return in_slots(made * TOKEN_SCALE, there)
+        vectors, present = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
+        return in_slots(vectors * TOKEN_SCALE, present)
 
     def pool(self) -> nn.Module:
         """Return a pool of each frame's objects."""
@@ -307,20 +307,20 @@ def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
         hand: (N, >= 3), its place in the world, m. size: factor of the errors; 1: those of the package's detector.
     """
     noisy = upright(slots)
-    there = field(noisy, "present").squeeze(-1) > 0
+    present = field(noisy, "present").squeeze(-1) > 0
     kind = field(noisy, "class").squeeze(-1).long()
-    place, joint = field(noisy, "position"), field(noisy, "joint")
-    at_hand = _error(place, *AT_HAND_PLACE) * place.new_tensor([1.0, 1.0, HIGHER])
-    at_hand *= (place - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND
-    of_kinds = _error(place.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
-    down = _too_low(place, kind)
-    place += size * (_error(place, *PLACE) + of_kinds + at_hand + down)
+    position, joint = field(noisy, "position"), field(noisy, "joint")
+    at_hand = _error(position, *AT_HAND_PLACE) * position.new_tensor([1.0, 1.0, HIGHER])
+    at_hand *= (position - hand[:, None, :3]).norm(dim=-1, keepdim=True) < AT_HAND
+    of_kinds = _error(position.new_empty(len(classes()), 3), *KIND_PLACE)[kind]
+    down = _too_low(position, kind)
+    position += size * (_error(position, *PLACE) + of_kinds + at_hand + down)
     for name, how in JOINT.items():
         joint += size * _error(joint, *how) * (kind == classes().index(name))[..., None]
     _turn(noisy, size * _error(joint, *TURN).squeeze(-1))
     missed = torch.rand_like(joint).squeeze(-1) < size * MISSED
     missed |= (torch.rand(len(classes()), device=kind.device) < size * KIND_MISSED)[kind]
-    _add_false(noisy, there & ~missed, size)
+    _add_false(noisy, present & ~missed, size)
     return in_order(noisy)
 
 
@@ -329,11 +329,11 @@ def _error(like: Tensor, size: float, spread: float) -> Tensor:
     return torch.randn_like(like) * size * (spread * torch.randn_like(like[..., :1])).exp()
 
 
-def _too_low(place: Tensor, kind: Tensor) -> Tensor:
+def _too_low(position: Tensor, kind: Tensor) -> Tensor:
     """Return the error (N, SLOTS, 3) of lifted things along the line of sight, m."""
     share = (LOW * torch.randn(len(classes()), device=kind.device)).abs().clamp(max=1.0)[kind]
-    height = (place[..., 2] - _standing().to(place)[kind]).clamp(0.0, LOW_UP_TO)
-    sight = place - place.new_tensor(AGENTVIEW_POSITION)
+    height = (position[..., 2] - _standing().to(position)[kind]).clamp(0.0, LOW_UP_TO)
+    sight = position - position.new_tensor(AGENTVIEW_POSITION)
     return sight / -sight[..., 2:].clamp(max=-0.1) * (share * height)[..., None]
 
 
@@ -351,25 +351,26 @@ def _turn(noisy: Tensor, angle: Tensor) -> None:
     field(noisy, "rotation")[:] = torch.stack([cosine * x - sine * y, sine * x + cosine * y, z], dim=-1).flatten(-2)
 
 
-def _add_false(noisy: Tensor, there: Tensor, size: float) -> None:
-    """Remove things that are not ``there`` (N, SLOTS), and add false objects to some empty slots."""
-    empty = (~there).sum(dim=1, keepdim=True).clamp(min=1)
-    chance = size * FALSE / empty * there.any(dim=1, keepdim=True)
-    false = ~there & (torch.rand(there.shape, device=noisy.device) < chance)
+def _add_false(noisy: Tensor, present: Tensor, size: float) -> None:
+    """Remove things that are not ``present`` (N, SLOTS), and add false objects to some empty slots."""
+    empty = (~present).sum(dim=1, keepdim=True).clamp(min=1)
+    chance = size * FALSE / empty * present.any(dim=1, keepdim=True)
+    false = ~present & (torch.rand(present.shape, device=noisy.device) < chance)
     row = false.nonzero()[:, 0]
-    made = noisy[row, torch.multinomial(there[row].float(), 1)[:, 0]] if len(row) else noisy[false]
-    misnamed = torch.rand(len(made), 1, device=noisy.device) < SECOND_NAME
-    kind, place = field(made, "class"), field(made, "position")
+    added = noisy[row, torch.multinomial(present[row].float(), 1)[:, 0]] if len(row) else noisy[false]
+    misnamed = torch.rand(len(added), 1, device=noisy.device) < SECOND_NAME
+    kind, position = field(added, "class"), field(added, "position")
     kind[:] = torch.where(misnamed, torch.randint_like(kind, len(classes())), kind)
-    place += torch.randn_like(place) * torch.where(misnamed, MISNAMED, ASTRAY)
-    noisy[~there] = 0.0
-    noisy[false] = made
+    position += torch.randn_like(position) * torch.where(misnamed, MISNAMED, ASTRAY)
+    noisy[~present] = 0.0
+    noisy[false] = added
 
 
 def in_order(slots: Tensor) -> Tensor:
     """Return slots (N, n, WIDTH) sorted as by `sim.object_slots.fill_slots`: by class and place, empty slots last."""
-    kind, place = field(slots, "class").squeeze(-1), field(slots, "position")
-    first = torch.where(kind == classes().index("drawer"), -place[..., 2], place[..., 0])  # drawers from the top
+    kind, position = field(slots, "class").squeeze(-1), field(slots, "position")
+    first = torch.where(kind == classes().index("drawer"), -position[..., 2], position[..., 0])  # drawers from the top
+    # Classes are whole numbers, and a place adds less than half of one.
     order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
     rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
     return rows

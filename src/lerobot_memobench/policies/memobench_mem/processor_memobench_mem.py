@@ -205,7 +205,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         """Return what the class describes for frames of the dataset, by their global indices."""
         config = self.config
         assert config is not None
-        places = [lookup.locate(index) for index in indices]
+        located = [lookup.locate(index) for index in indices]
         features = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
         features |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
         if config.memory == NONE:
@@ -218,15 +218,15 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
             written = lookup.changes(episode)
             return written[mechanism.slots(int(np.searchsorted(written, last, "right")) - 1, settings)]
 
-        recalled = [(episode, slots(episode, frame // stride)) for episode, frame in places]
-        ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in places]
+        recalled = [(episode, slots(episode, frame // stride)) for episode, frame in located]
+        ahead = [np.arange(frame // stride + 1, frame // stride + 1 + mechanism.ahead) for _, frame in located]
         memory, numbers = _histories(lookup, recalled, ahead)
         if self.subgoals:
             number = {text: row for row, text in enumerate(texts_of(self.subgoals))}
             known = np.array([*(number.get(text, -1) for text in lookup.texts), -1])
             rows = lookup.text_rows(config.subgoal_level)
-            asked = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
-            memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in asked.items()}
+            labelled = {SUBGOAL: np.asarray(indices), SUBGOALS: numbers.numpy()}
+            memory |= {name: torch.from_numpy(known[rows[frames]]) for name, frames in labelled.items()}
         if config.align == "none":
             return memory | features
         texts = torch.from_numpy(lookup.text_rows(config.subgoal_level)).long()
@@ -258,7 +258,7 @@ def _histories(
     unique = {episode: np.unique(np.concatenate(needed[episode])) for episode in sorted(needed)}
     first = dict(zip(unique, np.cumsum([0, *map(len, unique.values())]), strict=False))
 
-    def places(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
+    def frame_indices(wanted: Sequence[tuple[int, np.ndarray]], width: int) -> Tensor:
         indices = np.full((len(wanted), width), -1)
         for row, (episode, slots) in enumerate(wanted):
             indices[row, : len(slots)] = first[episode] + np.searchsorted(unique[episode], slots)
@@ -267,8 +267,9 @@ def _histories(
     steps = torch.from_numpy(np.concatenate([slots * stride for slots in unique.values()]))
     starts = np.repeat([lookup.episodes[episode] for episode in unique], [len(slots) for slots in unique.values()])
     frames = torch.cat([lookup.tokens(episode, slots.tolist()) for episode, slots in unique.items()])
-    histories = {FRAMES: frames, STEPS: steps, PLACES: places(recalled, max(len(slots) for _, slots in recalled))}
-    histories |= {AHEAD: places(following, len(ahead[0]))} if len(ahead[0]) else {}
+    longest = max(len(slots) for _, slots in recalled)
+    histories = {FRAMES: frames, STEPS: steps, PLACES: frame_indices(recalled, longest)}
+    histories |= {AHEAD: frame_indices(following, len(ahead[0]))} if len(ahead[0]) else {}
     return histories, steps + torch.from_numpy(starts)
 
 

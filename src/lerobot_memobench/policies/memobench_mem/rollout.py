@@ -74,6 +74,7 @@ class EnvMemory:
 
     def draw_seed(self, observed: Iterable[Tensor]) -> None:
         """Set the seed of the episode's noise from its first observation and the process's seed."""
+        # 56 bits, so that the seed plus a position is within torch's range.
         digest = hashlib.blake2b(str(torch.initial_seed()).encode(), digest_size=7)
         for value in observed:
             digest.update(value.detach().to("cpu").contiguous().numpy().tobytes())

@@ -78,10 +78,10 @@ def choices(subgoals: dict[str, list[str]], tasks: str | Sequence[str]) -> Tenso
 
 def answers(texts: Sequence[str], episodes: np.ndarray) -> list[str]:
     """Return all subgoals of a frame's episode as one text, which is constant in the episode."""
-    made: list[str] = []
+    joined: list[str] = []
     for own in _of_episodes(texts, episodes):
-        made += ["; ".join(filter(None, dict.fromkeys(own)))] * len(own)
-    return made
+        joined += ["; ".join(filter(None, dict.fromkeys(own)))] * len(own)
+    return joined
 
 
 def progress(texts: Sequence[str], episodes: np.ndarray, tasks: Sequence[str]) -> list[str]:
@@ -92,16 +92,16 @@ def progress(texts: Sequence[str], episodes: np.ndarray, tasks: Sequence[str]) -
     orders = [list(filter(None, dict.fromkeys(own))) for own in _of_episodes(texts, episodes)]
     shared: dict[tuple[str, int], set[str]] = {}
     for task, order in zip(tasks, orders, strict=True):
-        for place, text in enumerate(order):
+        for position, text in enumerate(order):
             words = set(text.split())
-            shared[task, place] = shared.get((task, place), words) & words
-    made: list[str] = []
+            shared[task, position] = shared.get((task, position), words) & words
+    shortened: list[str] = []
     for task, order, own in zip(tasks, orders, _of_episodes(texts, episodes), strict=True):
         cut = {"": ""}
-        for place, text in enumerate(order):
-            cut[text] = " ".join(word for word in text.split() if word in shared[task, place]) or NO_WORD
-        made += [cut[text] for text in own]
-    return made
+        for position, text in enumerate(order):
+            cut[text] = " ".join(word for word in text.split() if word in shared[task, position]) or NO_WORD
+        shortened += [cut[text] for text in own]
+    return shortened
 
 
 def shuffled(texts: Sequence[str], episodes: np.ndarray, seed: int = SHUFFLE_SEED) -> list[str]:
@@ -111,7 +111,7 @@ def shuffled(texts: Sequence[str], episodes: np.ndarray, seed: int = SHUFFLE_SEE
     information. Episodes with fewer than `SHUFFLED_ALONE` subgoals therefore draw texts of other episodes: of other
     tasks if there are enough, else of the whole dataset.
     """
-    every, made, elsewhere = sorted({*texts} - {""}), list[str](), 0
+    every, permuted, elsewhere = sorted({*texts} - {""}), list[str](), 0
     for episode, own in enumerate(_of_episodes(texts, episodes)):
         present = sorted({*own} - {""})
         chance = np.random.default_rng([seed, episode])
@@ -120,17 +120,17 @@ def shuffled(texts: Sequence[str], episodes: np.ndarray, seed: int = SHUFFLE_SEE
             order = chance.permutation(present).tolist()
             replace = dict(zip(order, np.roll(order, 1).tolist(), strict=True))
         else:
-            others = [text for text in every if text not in present]
-            pool = others if len(others) >= SHUFFLED_ALONE * len(present) else every
+            absent = [text for text in every if text not in present]
+            pool = absent if len(absent) >= SHUFFLED_ALONE * len(present) else every
             replace = dict(zip(present, chance.choice(pool, len(present), replace=False).tolist(), strict=True))
             elsewhere += 1
-        made += [replace.get(text, "") for text in own]
+        permuted += [replace.get(text, "") for text in own]
     logger.info(
         "subgoals are shuffled: %d of %d episodes permute their own; %d have fewer than %d and take texts of other "
         "episodes",
         *(len(episodes) - 1 - elsewhere, len(episodes) - 1, elsewhere, SHUFFLED_ALONE),
     )
-    return made
+    return permuted
 
 
 # -- frozen encoders ---------------------------------------------------------------------------------------------------

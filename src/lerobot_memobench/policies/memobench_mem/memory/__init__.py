@@ -41,11 +41,7 @@ def mechanism_names() -> list[str]:
 
 @cache
 def find_mechanism(name: str) -> type[MemoryMechanism]:
-    """Return a mechanism by its name.
-
-    Raises:
-        MemobenchError: the name is unknown or ambiguous, or the package that adds it is broken.
-    """
+    """Return a mechanism; a `MemobenchError` if its name is unknown or ambiguous, or its package is broken."""
     points = [point for point in entry_points(group=GROUP) if point.name == name]
     if name in OURS:
         for point in points:
@@ -73,42 +69,41 @@ def find_mechanism(name: str) -> type[MemoryMechanism]:
     return mechanism
 
 
-def settings_of_another(name: str, given: Mapping[str, Any]) -> str | None:
-    """Return another mechanism whose settings are all ``given`` and include those that this mechanism lacks."""
-    strange = set(given) - setting_names(name)
+def settings_of_another(name: str, values: Mapping[str, Any]) -> str | None:
+    """Return another mechanism whose settings are all in ``values`` and include those that this mechanism lacks."""
+    strange = set(values) - setting_names(name)
     if not strange:
         return None
     for other in mechanism_names():
         with suppress(MemobenchError):  # of a broken package
-            if strange <= setting_names(other) <= set(given):
+            if strange <= setting_names(other) <= set(values):
                 return other
     return None
 
 
 def setting_names(name: str) -> set[str]:
     """Return the names of a mechanism's settings."""
-    return {one.name for one in fields(find_mechanism(name).Settings)}
+    return {setting.name for setting in fields(find_mechanism(name).Settings)}
 
 
-def mechanism_settings(name: str, given: Mapping[str, Any]) -> Any:
-    """Return the settings of a mechanism, with defaults for those that are not ``given``.
+def mechanism_settings(name: str, values: Mapping[str, Any]) -> Any:
+    """Return the settings of a mechanism, with defaults for those that ``values`` lacks.
 
-    Raises:
-        MemobenchError: a setting is unknown, or has a wrong type or value.
+    A `MemobenchError` if a setting is unknown, or has a wrong type or value.
     """
     known = setting_names(name)
-    for key in given:
+    for key in values:
         if key not in known:
             hint = nearest(key, known) if known else "it has no settings."
             raise MemobenchError(f"policy.memory_settings: unknown setting '{key}' for memory={name}; {hint}")
     settings = find_mechanism(name).Settings
-    for key, value in given.items():
+    for key, value in values.items():
         _check_type(name, key, value, get_type_hints(settings)[key])
     try:
-        return draccus.decode(settings, dict(given))
+        return draccus.decode(settings, dict(values))
     except Exception as error:  # draccus raises errors of its own kinds
         raise MemobenchError(
-            f"policy.memory_settings={dict(given)} of memory={name} cannot be read: {error.__cause__ or error}"
+            f"policy.memory_settings={dict(values)} of memory={name} cannot be read: {error.__cause__ or error}"
         ) from None
 
 

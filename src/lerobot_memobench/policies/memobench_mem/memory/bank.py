@@ -23,7 +23,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     State,
 )
 
-PERCEPTUAL_WIDTH, HEADS, BLOCKS = 256, 4, 2
+PERCEPTUAL_WIDTH, HEADS, BLOCKS = 256, 4, 2  # channels as in the source, heads as in one of its releases
 WAVES, TIME_BASE = 128, 10_000.0
 
 
@@ -79,12 +79,12 @@ class Bank(MemoryMechanism):
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Fuse the frame with its retrieval, and append the result as an entry."""
         count = state["count"]
-        made = {"count": (count + 1).clamp(max=self.capacity)}
+        written = {"count": (count + 1).clamp(max=self.capacity)}
         for name, present in self._present(tokens).items():
             entries, steps = state[name], state[f"{name}_steps"]
             fused, _ = self.streams[name](present, entries, steps, count, step)
-            made[name], made[f"{name}_steps"] = append(entries, steps, count, fused.float(), step)
-        return made
+            written[name], written[f"{name}_steps"] = append(entries, steps, count, fused.float(), step)
+        return written
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the present fused with its retrieval: P perceptual tokens and one cognitive token."""
@@ -98,10 +98,10 @@ class Bank(MemoryMechanism):
             read.append(self.out[name](fused))
             shares.append(shares_of(looked, present.shape[1]))
             steps.append(state[f"{name}_steps"].masked_fill(~real, -1))
-        each, (perceptual, cognitive) = torch.cat(read, dim=1), shares
+        tokens, (perceptual, cognitive) = torch.cat(read, dim=1), shares
         sources = torch.cat([F.pad(perceptual, (0, self.capacity)), F.pad(cognitive, (self.capacity, 0))], dim=1)
-        mask = torch.ones(each.shape[:2], dtype=torch.bool, device=each.device)
-        return MemoryTokens(each, mask, sources=(sources, torch.cat(steps, dim=1)))
+        mask = torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device)
+        return MemoryTokens(tokens, mask, sources=(sources, torch.cat(steps, dim=1)))
 
 
 class Lookup(nn.Module):
@@ -119,7 +119,7 @@ class Lookup(nn.Module):
         The projections of keys and values (R, M, d) are applied to the query and to the weighted sum instead: the
         products are the same, and there are many times more keys than queries. ``hidden`` (R, M) are masked out.
         """
-        of_key, of_value = (one.weight.unflatten(0, (HEADS, -1)) for one in (self.key, self.value))
+        of_key, of_value = (linear.weight.unflatten(0, (HEADS, -1)) for linear in (self.key, self.value))
         query = torch.einsum("rnhe,hed->rhnd", self.query(asking).unflatten(2, (HEADS, -1)), of_key).flatten(1, 2)
         scores = torch.bmm(query, keys.transpose(1, 2)) * of_key.shape[1] ** -0.5
         weights = scores.masked_fill(hidden[:, None], -torch.inf).softmax(dim=2)
@@ -187,7 +187,7 @@ def append(entries: Tensor, steps: Tensor, count: Tensor, new: Tensor, now: Tens
     unit = F.normalize(entries, dim=3)
     pair = (unit[:, :-1] * unit[:, 1:]).sum(dim=3).mean(dim=2).argmax(dim=1)[:, None]  # the first of two
     slots, full, free = torch.arange(length, device=count.device), (count == length)[:, None], count[:, None]
-    kept = torch.where(full, slots + (slots > pair), torch.where(slots == free, length, slots))
-    other = kept + (full & (slots == pair))
+    source = torch.where(full, slots + (slots > pair), torch.where(slots == free, length, slots))
+    other = source + (full & (slots == pair))
     row = torch.arange(len(entries), device=count.device)[:, None]
-    return (entries[row, kept] + entries[row, other]) / 2, (steps[row, kept] + steps[row, other]) / 2
+    return (entries[row, source] + entries[row, other]) / 2, (steps[row, source] + steps[row, other]) / 2

@@ -24,7 +24,7 @@ from lerobot_memobench.policies.memobench_mem.memory.recurrent import (
     projection,
 )
 
-HEADS, FRAMES_READ = 2, 8
+HEADS, FRAMES_READ = 2, 8  # frames 16 control steps apart: a chunk reads the last 128 steps directly
 BASE_RATE, MAX_RATE, MAX_STEP = 0.01, 0.1, 5.0
 """Initial and maximum rate of the inner step, and maximum norm of a head's step."""
 
@@ -77,7 +77,7 @@ class FastWeights(MemoryMechanism):
     def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
         """Take a gradient step on the frame, apply the weights to it, and drop the oldest frame's output."""
         frame = encode_frame(self.encoder, tokens, step)
-        asked, key, value = (
+        queries, key, value = (
             norm(rearrange(linear(frame), "r p (h d) -> r h p d", h=HEADS))
             for norm, linear in (
                 (self.query_norm, self.query),
@@ -87,11 +87,11 @@ class FastWeights(MemoryMechanism):
         )
         rate = rearrange(F.softplus(self.rate(frame)).clamp(max=MAX_RATE), "r p h -> r h p 1")
         with torch.autocast(frame.device.type, enabled=False):  # a step is about a hundredth of the weights
-            key, value, asked, rate = (part.to(state["weight"]) for part in (key, value, asked, rate))
+            key, value, queries, rate = (part.to(state["weight"]) for part in (key, value, queries, rate))
             weight, bias = self._learned(state["weight"], state["bias"], key, value, rate)
-            applied, _ = self._normed(asked @ weight + bias)
-        made = rearrange(applied + asked, "r h p d -> r p (h d)")
-        output = frame + self.attended(self.post_norm(made))
+            applied, _ = self._normed(queries @ weight + bias)
+        retrieved = rearrange(applied + queries, "r h p d -> r p (h d)")
+        output = frame + self.attended(self.post_norm(retrieved))
         return {
             "weight": weight,
             "bias": bias,
@@ -104,8 +104,8 @@ class FastWeights(MemoryMechanism):
 
         Its gradients are written out: it needs no autograd in a rollout, and training differentiates through it.
         """
-        made, (unit, root) = self._normed(key @ weight + bias)
-        error = (made - (value - key)) * (1 + self.scale)
+        predicted, (unit, root) = self._normed(key @ weight + bias)
+        error = (predicted - (value - key)) * (1 + self.scale)
         step = rate * root * (error - unit * (error * unit).mean(dim=-1, keepdim=True))
         return weight - _shortened(key.mT @ step), bias - _shortened(step.sum(dim=-2, keepdim=True))
 
@@ -117,9 +117,9 @@ class FastWeights(MemoryMechanism):
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the outputs of the last frames."""
-        each: Tensor = self.out(state["outputs"].flatten(1, 2))
+        tokens: Tensor = self.out(state["outputs"].flatten(1, 2))
         steps = repeat(state["steps"], "r f -> r (f p)", p=self.spec.tokens)
-        return MemoryTokens(each, steps >= 0, steps=steps)
+        return MemoryTokens(tokens, steps >= 0, steps=steps)
 
 
 def _shortened(step: Tensor) -> Tensor:

@@ -117,31 +117,31 @@ class FrameSampling(MemoryMechanism):
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the encoded sampled frames of each row, padded to F."""
         count, device = self.settings.frames, self.encoder.project.weight.device
-        rows = [[kept[slot] for slot in sample_frames(len(kept) - 1, count)] for kept in state]
+        rows = [[row[slot] for slot in sample_frames(len(row) - 1, count)] for row in state]
         read = [frame for row in rows for frame in row]
-        places, steps = torch.zeros(len(rows), count, dtype=torch.int64), torch.zeros(len(read), dtype=torch.int64)
+        indices, steps = torch.zeros(len(rows), count, dtype=torch.int64), torch.zeros(len(read), dtype=torch.int64)
         real = torch.arange(count) < torch.tensor([[len(row)] for row in rows])
-        places[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
-        places, steps, real = places.to(device), steps.to(device), real.to(device)
-        each = self._each(read, steps)
+        indices[real], steps[:] = torch.arange(len(read)), torch.tensor([frame.step for frame in read])
+        indices, steps, real = indices.to(device), steps.to(device), real.to(device)
+        tokens = self._frame_tokens(read, steps)
         for number, frame in enumerate(read):
             if frame.noise is not None:
-                each = each.clone()
-                each[number] = with_noise(each[number], torch.Generator().manual_seed(frame.noise))
-        return self._tokens(each[places].flatten(1, 2), real, steps[places])
+                tokens = tokens.clone()
+                tokens[number] = with_noise(tokens[number], torch.Generator().manual_seed(frame.noise))
+        return self._tokens(tokens[indices].flatten(1, 2), real, steps[indices])
 
-    def _each(self, read: list[RememberedFrame], steps: Tensor) -> Tensor:
+    def _frame_tokens(self, read: list[RememberedFrame], steps: Tensor) -> Tensor:
         """Return the memory tokens (N, P, d_m) of frames; tokens of objects are computed once per frame."""
         new = [number for number, frame in enumerate(read) if frame.tokens is None]
-        made = [frame.tokens for frame in read]
+        cached = [frame.tokens for frame in read]
         if new:
             stored = torch.stack([read[number].stored for number in new]).to(steps.device)
             tokens = self._encoded(stored, steps[new])
             if not isinstance(self.pool, ObjectPool):
                 return tokens
-            for number, made[number] in zip(new, tokens, strict=True):
-                read[number].tokens = made[number]
-        return torch.stack(made)  # type: ignore[arg-type]  # none is None now
+            for number, cached[number] in zip(new, tokens, strict=True):
+                read[number].tokens = cached[number]
+        return torch.stack(cached)  # type: ignore[arg-type]  # none is None now
 
     def join(self, states: Sequence[State]) -> State:
         """Concatenate the rows of several states."""
@@ -156,8 +156,8 @@ class FrameSampling(MemoryMechanism):
         """Encode each frame once for all samples that read it."""
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
-        each = self._encoded(histories.frames, histories.steps)
-        tokens = self._tokens(each, real, histories.steps[places])
+        encoded = self._encoded(histories.frames, histories.steps)
+        tokens = self._tokens(encoded, real, histories.steps[places])
         return tokens._replace(places=places)
 
     def _encoded(self, frames: Tensor, steps: Tensor) -> Tensor:
@@ -170,15 +170,15 @@ class FrameSampling(MemoryMechanism):
         encoded: Tensor = self.encoder(tokens.unsqueeze(1), steps[:, None]).squeeze(1)
         return encoded
 
-    def _tokens(self, each: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
+    def _tokens(self, encoded: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
         mask, steps = (repeat(of_frames, "b f -> b (f p)", p=self.spec.tokens) for of_frames in (real, steps))
-        return MemoryTokens(each, mask, steps=steps)
+        return MemoryTokens(encoded, mask, steps=steps)
 
 
 # -- the encoder ------------------------------------------------------------------------------------------------------
 
 
-POSITION_DIM = 768
+POSITION_DIM = 768  # sine and cosine of time, row and column at each frequency
 _FREQUENCIES = 128
 _TIME_BASE, _SPACE_BASE = 10_000.0, 1_000.0
 
@@ -210,10 +210,10 @@ class MemoryEncoder(nn.Module):
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
         # A training batch holds single frames with many equal steps.
         alone = steps.shape[1] == 1 and not steps.is_meta
-        at, places = steps.unique(return_inverse=True) if alone else (steps, None)
+        at, inverse = steps.unique(return_inverse=True) if alone else (steps, None)
         positions = F.linear(F.silu(self._positions(at)), of_position)
-        if places is not None:
-            positions = positions.index_select(0, places.flatten()).unflatten(0, places.shape)
+        if inverse is not None:
+            positions = positions.index_select(0, inverse.flatten()).unflatten(0, inverse.shape)
         return image + positions
 
     def _positions(self, steps: Tensor) -> Tensor:

@@ -110,39 +110,40 @@ class Keyframes(MemoryMechanism):
         """Keep the frame, run the high level, and count its nominations."""
         assert query is not None
         assert query.choices is not None
-        kept, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
-        kept_at, old_at = state["steps"][:, :NOMINATED], state["steps"][:, NOMINATED:]
+        keyframes, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
+        keyframe_at, old_at = state["steps"][:, :NOMINATED], state["steps"][:, NOMINATED:]
         recent = torch.cat([old[:, 1:], tokens.to(old.dtype).unsqueeze(1)], dim=1)
         recent_at = torch.cat([old_at[:, 1:], step.unsqueeze(1)], dim=1)
-        keys, there = self._shown(kept, kept_at, state["votes"], recent_at)
-        real = torch.cat([there, recent_at >= 0], dim=1)
+        keys, filled = self._shown(keyframes, keyframe_at, state["votes"], recent_at)
+        real = torch.cat([filled, recent_at >= 0], dim=1)
         scores, logits = self.ask_high_level(torch.cat([keys, recent], dim=1), real, query.choices)
         nominated = (logits > 0) & (recent_at >= 0)
-        again = (kept_at.unsqueeze(2) == recent_at.unsqueeze(1)) & nominated.unsqueeze(1)
+        again = (keyframe_at.unsqueeze(2) == recent_at.unsqueeze(1)) & nominated.unsqueeze(1)
         first = nominated & ~again.any(dim=1)
         votes = torch.cat([state["votes"] + again.sum(dim=2), first.long()], dim=1)
-        at = torch.cat([kept_at, recent_at.masked_fill(~first, -1)], dim=1)
+        at = torch.cat([keyframe_at, recent_at.masked_fill(~first, -1)], dim=1)
         latest = at.argsort(dim=1, stable=True)[:, -NOMINATED:]
         rows = torch.arange(len(at), device=at.device).unsqueeze(1)
-        kept, kept_at = torch.cat([kept, recent], dim=1)[rows, latest], at[rows, latest]
+        keyframes, keyframe_at = torch.cat([keyframes, recent], dim=1)[rows, latest], at[rows, latest]
         return {
-            "frames": torch.cat([kept, recent], dim=1),
-            "steps": torch.cat([kept_at, recent_at], dim=1),
+            "frames": torch.cat([keyframes, recent], dim=1),
+            "steps": torch.cat([keyframe_at, recent_at], dim=1),
             "votes": votes[rows, latest],
             "text": scores.argmax(dim=1),
         }
 
-    def _shown(self, kept: Tensor, kept_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
-        chosen = torch.full((len(kept), SHOWN), -1)
+    def _shown(self, keyframes: Tensor, keyframe_at: Tensor, votes: Tensor, recent_at: Tensor) -> tuple[Tensor, Tensor]:
+        chosen = torch.full((len(keyframes), SHOWN), -1)
         for row, (steps, counts, recent) in enumerate(
-            zip(kept_at.tolist(), votes.tolist(), recent_at.tolist(), strict=True)
+            zip(keyframe_at.tolist(), votes.tolist(), recent_at.tolist(), strict=True)
         ):
             nominated = [step for step, count in zip(steps, counts, strict=True) for _ in range(count)]
             window = min(step for step in recent if step >= 0)
             frames = [steps.index(step) for step in shown_keyframes(nominated, GAP * self.spec.stride, window)]
             chosen[row, SHOWN - len(frames) :] = torch.tensor(frames, dtype=torch.int64)
-        chosen = chosen.to(kept.device)
-        return kept[torch.arange(len(kept), device=kept.device).unsqueeze(1), chosen.clamp(min=0)], chosen >= 0
+        chosen = chosen.to(keyframes.device)
+        rows = torch.arange(len(keyframes), device=keyframes.device).unsqueeze(1)
+        return keyframes[rows, chosen.clamp(min=0)], chosen >= 0
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the words of the text that the high level chose last."""
@@ -167,10 +168,10 @@ class Keyframes(MemoryMechanism):
             following = histories.ahead[:, 0]
             target = torch.where(following < 0, target, histories.subgoals[following.clamp(min=0)])
         recent = slots[:, SHOWN:] >= 0
-        each = F.binary_cross_entropy_with_logits(logits.float(), keyframe.float(), reduction="none") * recent
+        errors = F.binary_cross_entropy_with_logits(logits.float(), keyframe.float(), reduction="none") * recent
         self._losses = {
             "subtask": F.cross_entropy(scores, target, ignore_index=-1, reduction="none"),
-            "keyframes": each.sum(dim=1) / recent.sum(dim=1),
+            "keyframes": errors.sum(dim=1) / recent.sum(dim=1),
         }
         return MemoryTokens(*self.texts(torch.where(target < 0, self.count, target)))
 

@@ -172,12 +172,7 @@ class MemoryMechanism(nn.Module, ABC):
     capacity: int
 
     def __init__(self, spec: MemorySpec, pool: nn.Module, settings: Any) -> None:
-        """Build the mechanism.
-
-        Args:
-            pool: maps N stored frames (N, P', D') to tokens (N, P, D). It is trained as a part of the memory.
-            settings: an instance of `Settings`.
-        """
+        """Build it; ``pool`` maps N stored frames (N, P', D') to tokens (N, P, D), and is trained as a part."""
         super().__init__()
         self.spec, self.pool, self.settings = spec, pool, settings
 
@@ -216,7 +211,7 @@ class MemoryMechanism(nn.Module, ABC):
         Frames of pictures are stored in bfloat16; weights are float32 in training and usually in a rollout.
         """
         tokens: Tensor = self.pool(frames)
-        own = next((one for name, one in self.named_parameters() if not name.startswith("pool.")), tokens)
+        own = next((parameter for name, parameter in self.named_parameters() if not name.startswith("pool.")), tokens)
         return tokens.to(torch.promote_types(tokens.dtype, own.dtype))
 
     def join(self, states: Sequence[State]) -> State:
@@ -225,8 +220,8 @@ class MemoryMechanism(nn.Module, ABC):
 
     def noised(self, state: State, generator: torch.Generator) -> State:
         """Return the state with noise on what it holds of frames, not on times and counts (``corrupt=noise``)."""
-        held = {name: value for name, value in state.items() if not name.endswith("steps")}
-        return {**state, **{name: with_noise(value, generator) for name, value in held.items()}}
+        contents = {name: value for name, value in state.items() if not name.endswith("steps")}
+        return {**state, **{name: with_noise(value, generator) for name, value in contents.items()}}
 
     # -- a training --------------------------------------------------------------------------------------------------
 
@@ -240,9 +235,6 @@ class MemoryMechanism(nn.Module, ABC):
 
         All but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
         episode. Histories must begin at the same frame for all samples of an episode.
-
-        Args:
-            query: the samples' present.
         """
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
@@ -308,10 +300,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the mechanism's own losses by name, (B,) each and weighted; called after `replay` and the actions.
 
         When a loss is only measured, a privileged memory replays the histories with labels, and then without them, so
-        that the actions follow its own choice.
-
-        Args:
-            batch: the training batch, and `MemoryPass.outputs` of its fusion.
+        that the actions follow its own choice. ``batch`` also holds `MemoryPass.outputs` of its fusion.
         """
         return {}
 

@@ -44,7 +44,7 @@ from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH, field
 
 HINDSIGHT, FORESIGHT = 8, 8
 """Number of remembered motions (h) and of predicted motions (n)."""
-FORESIGHT_WEIGHT = 0.01
+FORESIGHT_WEIGHT = 0.01  # HiF-VLA's
 LAYERS, HEADS = 4, 8
 FORESEEN = "memory.foreseen"
 
@@ -356,31 +356,32 @@ class ObjectMotion(MotionField):
 
     def _between(self, before: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:
         """Return the field (N, C, K), and the cell of each thing in the later frame, (N, C)."""
-        (then, kind, place, joint), (later, later_kind, later_place, later_joint) = map(self._cells, (before, now))
-        apart = torch.cdist(place, later_place)
+        then, kind, position, joint = self._cells(before)
+        later, later_kind, later_position, later_joint = self._cells(now)
+        apart = torch.cdist(position, later_position)
         another = ~then.unsqueeze(2) | ~later.unsqueeze(1) | (kind.unsqueeze(2) != later_kind.unsqueeze(1))
         apart = apart.masked_fill(another | (apart > SAME), torch.inf)
         nearest = apart.argmin(dim=2)  # things match if each is the other's nearest of the same class
         back = apart.argmin(dim=1).gather(1, nearest)
         cells = torch.arange(self.cells, device=back.device)
         known = (back == cells) & apart.isfinite().any(dim=2)
-        gone = later_place.gather(1, nearest.unsqueeze(-1).expand_as(place)) - place
+        gone = later_position.gather(1, nearest.unsqueeze(-1).expand_as(position)) - position
         turned = later_joint.gather(1, nearest.unsqueeze(-1)) - joint
         moved = PER_STEP * torch.cat([gone, turned], dim=-1) * known.unsqueeze(-1)
-        seen = place.new_tensor(WORKSPACE_CENTRE)
-        parts = [moved, known.unsqueeze(-1), kind.unsqueeze(-1), (place - seen) * PER_METRE]
-        return torch.cat([part.to(place.dtype) for part in parts], dim=-1), nearest
+        seen = position.new_tensor(WORKSPACE_CENTRE)
+        parts = [moved, known.unsqueeze(-1), kind.unsqueeze(-1), (position - seen) * PER_METRE]
+        return torch.cat([part.to(position.dtype) for part in parts], dim=-1), nearest
 
     def _cells(self, frames: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return which cells of stored frames hold a thing (N, C), and their classes (N, C), places and joints."""
         slots, hand, _ = frames.to(torch.float32).flatten(1).split([SIZE, HAND_DIM, 1], dim=1)
         slots = slots.unflatten(1, (SLOTS, WIDTH))
         alone = torch.ones_like(hand[:, :1])
-        there = torch.cat([field(slots, "present").squeeze(-1), alone], dim=1) > 0
+        present = torch.cat([field(slots, "present").squeeze(-1), alone], dim=1) > 0
         kind = torch.cat([field(slots, "class").squeeze(-1), alone * (len(self.order) - 1)], dim=1)
-        place = torch.cat([field(slots, "position"), hand[:, None, :3]], dim=1)
+        position = torch.cat([field(slots, "position"), hand[:, None, :3]], dim=1)
         joint = torch.cat([field(slots, "joint"), 0 * alone.unsqueeze(-1)], dim=1)
-        return there, kind, place, joint
+        return present, kind, position, joint
 
     def following(self, frames: Tensor) -> tuple[Tensor, Tensor]:
         """Follow each thing of the first frame from frame to frame until it is lost."""
@@ -399,8 +400,8 @@ class ObjectMotion(MotionField):
 
     def tokens(self, fields: Tensor) -> Tensor:
         """Return a token per pair of frames."""
-        moved, known, kind, place = fields.split([MOVED, 1, 1, 3], dim=-1)
+        moved, known, kind, position = fields.split([MOVED, 1, 1, 3], dim=-1)
         kinds = torch.tensor(self.order, device=fields.device)[kind.squeeze(-1).long()]
-        made = self.mlp(torch.cat([moved, place, self.kind(kinds)], dim=-1))
-        weights = self.score(made).masked_fill(known == 0, -1e4).softmax(dim=2) * known.any(dim=2, keepdim=True)
-        return (made * weights).sum(dim=2) + self.times
+        features = self.mlp(torch.cat([moved, position, self.kind(kinds)], dim=-1))
+        weights = self.score(features).masked_fill(known == 0, -1e4).softmax(dim=2) * known.any(dim=2, keepdim=True)
+        return (features * weights).sum(dim=2) + self.times

@@ -87,27 +87,27 @@ class Recurrent(MemoryMechanism):
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
         both = self.pre_norm(torch.cat([frame, slots], dim=1))
         key, value = self.key_value(both).chunk(2, dim=-1)
-        asked = rearrange(self.query(both[:, -count:]), "r s (h d) -> r h s d", h=HEADS)
+        queries = rearrange(self.query(both[:, -count:]), "r s (h d) -> r h s d", h=HEADS)
         # All heads share the keys, so they are computed as one head with more rows, faster than torch's kernel.
-        asked = rotate_from(asked, length - count).flatten(1, 2) * key.shape[-1] ** -0.5
-        weights = (asked @ rotate_from(key, 0).mT).softmax(dim=-1)
+        queries = rotate_from(queries, length - count).flatten(1, 2) * key.shape[-1] ** -0.5
+        weights = (queries @ rotate_from(key, 0).mT).softmax(dim=-1)
         read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
         return {"slots": self.post_norm(self.attended(read) + slots)}
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
         """Return the slots at the width of memory tokens."""
-        each: Tensor = self.out(state["slots"])
-        return MemoryTokens(each, torch.ones(each.shape[:2], dtype=torch.bool, device=each.device))
+        tokens: Tensor = self.out(state["slots"])
+        return MemoryTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device))
 
 
 def projection(inputs: int, outputs: int, std: float = 0.02) -> nn.Linear:
     """Return a linear layer without bias, with weights drawn from N(0, std^2)."""
-    made = nn.Linear(inputs, outputs, bias=False)
-    nn.init.normal_(made.weight, std=std)
-    return made
+    linear = nn.Linear(inputs, outputs, bias=False)
+    nn.init.normal_(linear.weight, std=std)
+    return linear
 
 
 def encode_frame(encoder: MemoryEncoder, tokens: Tensor, step: Tensor) -> Tensor:
     """Encode a frame's tokens (R, P, D) with their places and its control step (R,): (R, P, d)."""
-    made: Tensor = encoder(tokens.unsqueeze(1), step.unsqueeze(1)).squeeze(1)
-    return made
+    encoded: Tensor = encoder(tokens.unsqueeze(1), step.unsqueeze(1)).squeeze(1)
+    return encoded

@@ -118,8 +118,9 @@ class NarrowPass(MemoryPass):
 
         Actions do not read the ``unread`` leading tokens; ``copies`` is 1 if the last token is the state's copy.
         """
-        places = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
-        part = (places >= unread).int() + (places >= len(places) - copies).int()  # 0: before the text, 1: text, 2: copy
+        positions = torch.arange(prefix.tokens.shape[1], device=prefix.tokens.device)
+        # 0: before the text, 1: text, 2: copy.
+        part = (positions >= unread).int() + (positions >= len(positions) - copies).int()
         of_query, of_key = part[:, None], part
         seen = torch.where(of_query == 2, of_key == 2, of_key <= of_query)
         return seen.expand(len(prefix.tokens), -1, -1)
