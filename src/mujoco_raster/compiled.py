@@ -34,8 +34,7 @@ def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]
 def _discard_unreadable_index(cache_file: Any) -> None:
     """Remove the index of a function's cache if it cannot be read.
 
-    The index contains the classes of the function's arguments. Numba imports them before it compares the time of the
-    source file, and fails if an earlier version of this package had them in another module.
+    Numba imports the classes of arguments before it compares the time of the source file, and fails if they moved.
     """
     try:
         cache_file._load_index()
