@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_memobench.constants import CLOCK
-from lerobot_memobench.datasets.episodes import DemonstrationRecord
+from lerobot_memobench.datasets.episodes import DemonstrationRecord, goals_of
 from lerobot_memobench.datasets.layout import EPISODE_INFO, OBJECTS, PRIVILEGED
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from tests.support.synthetic_dataset import clock_at
@@ -33,7 +33,7 @@ def state_at(hand: np.ndarray) -> np.ndarray:
     return np.array([*hand, 3.1, 0.05, 0.1, 0.03, -0.03], np.float32)
 
 
-def record_of(name: str, seed: int, prompt: int) -> str:
+def record_of(name: str, seed: int, prompt: int, goals: int | None = None) -> str:
     """Return the record of an episode, as `memobench generate` writes it."""
     return DemonstrationRecord(
         task_name=name,
@@ -46,6 +46,7 @@ def record_of(name: str, seed: int, prompt: int) -> str:
         success=True,
         exec_start_index=prompt,
         key_frames=[-1],
+        goals=goals_of(name) if goals is None else goals,
         scene_hash="",
         fixture_poses={},
         digest="",
@@ -60,11 +61,12 @@ def make_object_dataset(
     pictures: bool = False,
     repeats: int = 1,
     records: bool = False,
+    goals: int | None = None,
 ) -> Path:
     """Write episodes in which the hand moves to the one of three things that was lit in the prompt.
 
     With ``repeats`` each of the three kinds of episodes has that many; with ``records`` each names one of two
-    tasks.
+    tasks, whose goals have the version ``goals``; None: the present one.
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -106,7 +108,7 @@ def make_object_dataset(
                 "task": task,
             }
             if records:
-                frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt)
+                frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt, goals)
             if pictures:
                 frame["observation.images.image"] = np.full((48, 48, 3), t, np.uint8)
             dataset.add_frame(frame)

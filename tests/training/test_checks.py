@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,16 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_memobench.commands.command_line import parse_words, read_words
+from lerobot_memobench.datasets.episodes import goals_of
+from lerobot_memobench.envs.settings import STRICT_GOALS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 from lerobot_memobench.training.command import READ, check_settings, complete_training
 from lerobot_memobench.training.data import open_metadata
 from lerobot_memobench.training.loop import begin
+from tests.support.object_dataset import make_object_dataset
 
 LEROBOTS = [  # checks of LeRobot's configuration
     ("eval_steps=2", "dataset.eval_split"),
@@ -61,6 +67,15 @@ def test_each_field_of_lerobots_configuration_is_read_or_refused() -> None:
     asked.field_of_tomorrow = 3
     with pytest.raises(MemobenchError, match="field_of_tomorrow=3 has no effect"):
         check_settings(asked)
+
+
+@pytest.mark.parametrize("goals", [None, 3])
+def test_demonstrations_of_other_goals_are_refused(tmp_path: Path, goals: int | None) -> None:
+    assert (goals_of(task_names(suite=STRICT)[0]), goals_of(task_names(suite=PUBLISHED)[0])) == (STRICT_GOALS, 0)
+    root = make_object_dataset(tmp_path / "data", records=True, goals=goals)
+    error = pytest.raises(MemobenchError, match=r"episode 0: the goal of .* has version 3, expected 0")
+    with nullcontext() if goals is None else error:
+        open_metadata(DatasetConfig("memobench/objects", root=str(root)))
 
 
 def test_accumulation_of_gradients_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

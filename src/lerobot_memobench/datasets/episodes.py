@@ -33,6 +33,7 @@ from lerobot_memobench.datasets.layout import (
     TASKS_FILE,
     is_dataset,
 )
+from lerobot_memobench.envs.settings import STRICT_GOALS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
     Count,
@@ -48,6 +49,7 @@ from lerobot_memobench.io import (
     short,
 )
 from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -174,6 +176,7 @@ class DemonstrationRecord(BaseModel):
     success: bool = Field(description="the goal was reached")
     exec_start_index: Count = Field(description="first frame of the execution")
     key_frames: list[Whole] = Field(description="frame at which each checkpoint was completed in order, −1 if never")
+    goals: Count = Field(description="version of the goals of strict tasks; 0 for other tasks")
     scene_hash: str = Field(description="hash of the initial scene")
     fixture_poses: dict[str, list[Number]] = Field(description="JSON, fixture to position and quaternion wxyz")
     digest: str = Field(description="sha256 of states, actions and labels")
@@ -200,6 +203,7 @@ class DemonstrationRecord(BaseModel):
             success=bool(demo.success),
             exec_start_index=int(demo.exec_start),
             key_frames=key_frames(demo).tolist(),
+            goals=goals_of(demo.task.name),
             scene_hash=demo.scene_hash,
             fixture_poses={name: np.asarray(pose).tolist() for name, pose in demo.fixture_poses.items()},
             digest=digest(demo),
@@ -222,6 +226,11 @@ class DemonstrationRecord(BaseModel):
             "fixture_poses": json.dumps(self.fixture_poses),
             "stand_ins": json.dumps(self.stand_ins),
         }
+
+
+def goals_of(task_name: str) -> int:
+    """Return the version of a strict task's goals in this version of the package; 0 for other tasks."""
+    return STRICT_GOALS if suite_of(task_name) == STRICT else 0
 
 
 def from_frames(text: str, where: str) -> DemonstrationRecord:
@@ -432,6 +441,11 @@ def _rows(folder: Path, episode_index: int | None = None) -> list[dict[str, Any]
 def _listed(folder: Path, row: dict[str, Any], text: str | None) -> ListedEpisode:
     number = int(row["episode_index"])
     record = from_frames(text, f"{folder}, episode {number}") if text else from_meta(row)
+    if record is not None and record.goals != goals_of(record.task_name):
+        raise MemobenchError(
+            f"{folder}, episode {number}: the goal of {record.task_name} has version {record.goals}, expected "
+            f"{goals_of(record.task_name)}; generate the demonstrations again"
+        )
     return ListedEpisode(number, int(row["dataset_from_index"]), int(row["length"]), record)
 
 
