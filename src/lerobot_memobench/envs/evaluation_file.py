@@ -201,6 +201,8 @@ class Card(TypedDict):
 
 # --- reading and writing ---
 
+ADVICE = "expected an evaluation's file as `lerobot eval` writes it"
+
 
 def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     """Return the content of an evaluation's file; ``place``: its folder, or the file.
@@ -210,17 +212,26 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     Raises:
         MemobenchError: the file is missing, incomplete, malformed or of another format.
     """
-    file = place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
-    advice = "expected an evaluation's file as `lerobot eval` writes it"
+    file = _file_of(place)
     try:
-        card: dict[str, Any] = read_json(file, Card, advice)
+        card: dict[str, Any] = read_json(file, Card, ADVICE)
     except FileNotFoundError:
-        raise MemobenchError(f"{file} cannot be read (it is missing); {advice}") from None
+        raise MemobenchError(f"{file} cannot be read (it is missing); {ADVICE}") from None
+    if whole:
+        require_whole(place, card)
+    return card
+
+
+def require_whole(place: Path, card: Mapping[str, Any]) -> None:
+    """Refuse a card, read from ``place``, that lacks something that resuming and repeating need."""
     missing = [name for name in Card.__annotations__ if name not in card]
     missing += [f"{name} in protocol" for name in EXTENT if name not in card["protocol"]]
-    if whole and missing:
-        raise MemobenchError(f"{file}: found no {', '.join(missing)}; {advice}")
-    return card
+    if missing:
+        raise MemobenchError(f"{_file_of(place)}: found no {', '.join(missing)}; {ADVICE}")
+
+
+def _file_of(place: Path) -> Path:
+    return place / EVALUATION_FILE if place.is_dir() or not is_there(place) else place
 
 
 def has_evaluation(folder: Path) -> bool:
@@ -242,10 +253,10 @@ def check_facts(folder: Path, facts: Mapping[str, Any]) -> None:
     """
     if not has_evaluation(folder):
         return
-    if differences := differences_of_parts(read_evaluation(folder), facts):
-        what = "policy" if all(difference.startswith(f"{POLICY}.") for difference in differences) else "protocol"
+    if unequal := differences_of_parts(read_evaluation(folder), facts):
+        what = "policy" if all(difference.startswith(f"{POLICY}.") for difference in unequal) else "protocol"
         raise MemobenchError(
-            f"{folder} holds episodes of another {what} ({'; '.join(differences)}, the first value being that of the "
+            f"{folder} holds episodes of another {what} ({'; '.join(unequal)}, the first value being that of the "
             "episodes there); evaluate into another folder"
         )
 
@@ -286,16 +297,16 @@ def differences_of_parts(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str
 
 
 def _differing(a: Mapping[str, Any], b: Mapping[str, Any], prefix: str = "") -> list[str]:
-    differences = []
+    unequal = []
     for key, value in a.items():
         if key not in b or b[key] == value:
             continue
         other = b[key]
         if isinstance(value, Mapping) and isinstance(other, Mapping):
-            differences += _differing(value, other, f"{prefix}{key}.")
+            unequal += _differing(value, other, f"{prefix}{key}.")
         else:
-            differences.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
-    return differences
+            unequal.append(f"{cut(f'{prefix}{key}')}: {_text(value)} and {_text(other)}")
+    return unequal
 
 
 def _text(value: Any) -> str:

@@ -263,7 +263,14 @@ def read_run(folder: str | Path, name: str | None = None, method: str = "") -> R
         MemobenchError: it has no rollouts, or a line contradicts the settings in its file.
     """
     folder, notes = Path(folder), list[str]()
-    lines, card = read_lines(folder, notes), read_evaluation(folder)
+    return run_of(folder, read_lines(folder, notes), notes, name, method)
+
+
+def run_of(
+    folder: Path, lines: Sequence[Mapping[str, Any]], notes: Sequence[str], name: str | None = None, method: str = ""
+) -> Run:
+    """Return the evaluation in a folder, given the lines of its log and the notes of reading them; see `read_run`."""
+    card, notes = read_evaluation(folder), [*notes]
     records, extent = requested(card, joined(folder, card, lines)), extent_of(card)
     if len(records) < len(lines):
         notes.append(f"{count_of(len(lines) - len(records), 'rollout')} beyond those that were asked for left out")

@@ -33,7 +33,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
     summary_of,
 )
-from lerobot_memobench.evaluation.records import Run, read_run, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
     Name,
@@ -63,9 +63,10 @@ def write_report(directory: str | Path) -> Run:
     ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
     another process may write to it. Return the evaluation with warnings, see `read_run`.
     """
-    directory = Path(directory)
-    run = read_run(directory)
-    write_episodes(directory, read_lines(directory, []))
+    directory, notes = Path(directory), list[str]()
+    lines = read_lines(directory, notes)
+    run = run_of(directory, lines, notes)
+    write_episodes(directory, lines)
     values = {**report_values(run.summary), **evidence_values(run)}
     if run.not_run:
         values["not_run"] = run.not_run

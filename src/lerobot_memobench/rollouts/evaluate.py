@@ -23,6 +23,7 @@ from lerobot_memobench.envs.evaluation_file import (
     Acting,
     differences_of_parts,
     read_evaluation,
+    require_whole,
     write_evaluation,
 )
 from lerobot_memobench.envs.lerobot import Opener
@@ -220,7 +221,7 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
         if not earlier[POLICY]:
             note(f"note: {folder} names no policy: whether its episodes are of this policy cannot be checked")
         return card
-    earlier = read_evaluation(folder, whole=True)
+    require_whole(folder, earlier)
     edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
     if edited:
         raise MemobenchError(f"the files of {edited[0]} differ from those that the episodes in {folder} were run with")

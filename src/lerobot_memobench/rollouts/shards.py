@@ -17,12 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.envs.episode_log import Key, has_log, key_of, read_log, write_episodes
+from lerobot_memobench.envs.episode_log import Key, has_log, joined, key_of, read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import (
     EXTENT,
     POLICY,
     differences_of_parts,
     read_evaluation,
+    require_whole,
     write_evaluation,
 )
 from lerobot_memobench.errors import MemobenchError
@@ -213,8 +214,10 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
-    logs = {source: read_log(source) for source in sources}
-    card = _joined_card({source: read_evaluation(source) for source in sources})
+    lines = {source: read_lines(source) for source in sources}
+    cards = {source: read_evaluation(source) for source in sources}
+    logs = {source: joined(source, cards[source], lines[source]) for source in sources}
+    card = _joined_card(cards)
     records = join(logs)
 
     refuse_links(out / VIDEOS, out / MEMORY_READS)
@@ -255,15 +258,16 @@ def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
     if not all("runs" in part_card for part_card in cards.values()):
         protocol = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
         return {"format": card["format"], "protocol": protocol, POLICY: card[POLICY]}
-    whole = {folder: read_evaluation(folder, whole=True) for folder in cards}
-    joined = functools.reduce(partial(extended, again=False), whole.values())
-    for folder, part_card in whole.items():
+    for folder, part_card in cards.items():
+        require_whole(folder, part_card)
+    whole = functools.reduce(partial(extended, again=False), cards.values())
+    for folder, part_card in cards.items():
         for name, value in part_card["task_files"].items():
-            if joined["task_files"][name] != value:
+            if whole["task_files"][name] != value:
                 raise MemobenchError(
                     f"the episodes of {name} in {folder} were run with other task files than the others"
                 )
-    return joined
+    return whole
 
 
 def _share(source: Path, target: Path, pattern: str) -> None:
