@@ -58,6 +58,14 @@ DEMONSTRATION_SEED, VALIDATION_SEED = SPLITS["demonstrations"].start, SPLITS[VAL
 UNSEEDED = (1_000_000_000, 2_000_000_000)
 """Range of the seeds of episodes that are reset without a seed, above all other seeds."""
 
+WORLD, LIBERO = "world", "libero"
+"""Field of demonstrations that names the source of the scenes, and its value."""
+SCENE_HASH_VERSION = 2
+"""Raise it with each change of a scene's hash: of `Simulation.scene_hash`, of states, or of rounding in the simulation.
+
+1: release 0.2.0.
+"""
+
 # -- pictures
 
 CAMERAS = {"image": "agentview", "wrist_image": "wrist"}

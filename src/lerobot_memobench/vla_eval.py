@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.constants import ACTION_DIM, CAMERAS, EVALUATION_SEED, PROMPT, SEALED, SPLITS
+from lerobot_memobench.constants import ACTION_DIM, CAMERAS, EVALUATION_SEED, LIBERO, PROMPT, SEALED, SPLITS, WORLD
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.evaluation_file import Acting, check_facts, facts_of
 from lerobot_memobench.envs.lerobot import UNKNOWN_PLAN, MemobenchEnvConfig, check_loop
@@ -25,7 +25,6 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, rollout_value
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.libero_suites import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 

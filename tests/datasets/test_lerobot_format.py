@@ -12,7 +12,7 @@ from huggingface_hub import DatasetCard
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_memobench.constants import CLOCK
+from lerobot_memobench.constants import CLOCK, LIBERO
 from lerobot_memobench.datasets.demonstration import digest, labels
 from lerobot_memobench.datasets.episodes import read_episode
 from lerobot_memobench.datasets.layout import dataset_features, is_dataset
@@ -20,7 +20,6 @@ from lerobot_memobench.datasets.stage import stage_demonstration
 from lerobot_memobench.datasets.video import ImageHistograms
 from lerobot_memobench.datasets.write import assemble, numeric_stats, write_dataset
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.kills import hashes
 

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from lerobot_memobench.constants import LIBERO
 from lerobot_memobench.datasets.convert import convert
 from lerobot_memobench.datasets.demonstration import Demonstration, key_frames
 from lerobot_memobench.datasets.episodes import read_episode
@@ -16,7 +17,6 @@ from lerobot_memobench.datasets.hdf5 import PublishedDemo, PublishedFile
 from lerobot_memobench.datasets.restore import joints_of, restore, task_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.scene_hash import LIBERO
 from lerobot_memobench.sim.simulation import Simulation
 from tests.support import libero_layout
 from tests.support.short_demonstrations import drawn_steps, with_pictures

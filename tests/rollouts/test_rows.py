@@ -10,10 +10,10 @@ import pytest
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
+from lerobot_memobench.constants import SCENE_HASH_VERSION
 from lerobot_memobench.envs.episode_log import log_text, read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.envs.settings import SCENE_HASHES
-from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from tests.support.fake_loop import STOVE, FakeLoop
 
 BOARD = Path(__file__).parents[2] / "results" / "board"

@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from lerobot_memobench.constants import SCENE_HASH_VERSION
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.sim.simulation import InvalidActionError, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.board.rules import FEWEST, check_control, check_evaluation
-from lerobot_memobench.constants import EVIDENCE_EPISODES, PROMPT_HORIZON
+from lerobot_memobench.constants import EVIDENCE_EPISODES, PROMPT_HORIZON, SCENE_HASH_VERSION
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import evidence_line
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
@@ -25,7 +25,6 @@ from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.lerobot_config import tree_hash
-from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS

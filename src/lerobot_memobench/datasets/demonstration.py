@@ -20,14 +20,15 @@ from lerobot_memobench.constants import (
     CAMERAS,
     CONTROL_HZ,
     EXECUTION,
+    LIBERO,
     NO_CLOCK,
     OBS_PHASE,
     OBS_STEP,
     PROMPT,
     PROPRIO_DIM,
+    WORLD,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, STRICT, Task
 

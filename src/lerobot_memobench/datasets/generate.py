@@ -16,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.constants import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, SPLITS
+from lerobot_memobench.constants import DEMONSTRATION_SEED, GUARDED, IMAGE_SIZE, LIBERO, SPLITS, WORLD
 from lerobot_memobench.datasets.card import SCRIPTED
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING, is_dataset
 from lerobot_memobench.datasets.record import HOLD_FRAMES, RecordingJob, RecordingSettings
@@ -29,7 +29,6 @@ from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
-from lerobot_memobench.sim.scene_hash import LIBERO, WORLD
 from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 
 FRAMES = {

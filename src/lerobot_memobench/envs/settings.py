@@ -20,12 +20,12 @@ from lerobot_memobench.constants import (
     IMAGE_SIZE,
     PROMPT_HORIZON,
     PROTOCOLS,
+    SCENE_HASH_VERSION,
     UPSTREAM,
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
-from lerobot_memobench.sim.scene_hash import SCENE_HASH_VERSION
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
 from lerobot_memobench.tasks.task import (
     DIFFICULTIES,
