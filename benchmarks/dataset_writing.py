@@ -141,8 +141,8 @@ def quality(folder: Path, demos: list[Demonstration]) -> dict[str, Any]:
         errors = []
         for path in sorted((folder / "videos" / image_key(camera)).rglob("*.mp4")):
             with av.open(str(path)) as container:
-                for picture in container.decode(video=0):
-                    decoded = picture.to_ndarray(format="rgb24").astype(np.float32)
+                for image in container.decode(video=0):
+                    decoded = image.to_ndarray(format="rgb24").astype(np.float32)
                     errors.append(float(((decoded - rendered[len(errors)]) ** 2).mean()))
         assert len(errors) == len(rendered), (len(errors), len(rendered))
         result[f"psnr_{camera}"] = round(10 * np.log10(255**2 / float(np.mean(errors))), 2)

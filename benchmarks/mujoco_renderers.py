@@ -95,7 +95,7 @@ def compare(backend: str, files: list[Path], frames: int, sheet: Path | None) ->
     from mujoco_raster import Renderer
 
     warnings.simplefilter("ignore")  # objects that are not drawn
-    pictures = []
+    images = []
     for name, model, option, camera in models(files):
         model.vis.global_.offheight, model.vis.global_.offwidth = np.max(SIZES, axis=0)
         for height, width in SIZES:
@@ -118,11 +118,11 @@ def compare(backend: str, files: list[Path], frames: int, sheet: Path | None) ->
             for renderer in renderers.values():
                 renderer.close()
             if (height, width) == SIZES[-1]:
-                pictures.append(np.hstack([theirs, four, np.minimum(4 * np.abs(theirs - four), 255)]))
+                images.append(np.hstack([theirs, four, np.minimum(4 * np.abs(theirs - four), 255)]))
     if sheet:
         from PIL import Image
 
-        Image.fromarray(np.vstack(pictures).astype(np.uint8)).save(sheet)
+        Image.fromarray(np.vstack(images).astype(np.uint8)).save(sheet)
 
 
 def main() -> None:

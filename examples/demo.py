@@ -135,16 +135,16 @@ def table(outcomes: Mapping[str, Episodes]) -> str:
     return "\n".join([*head, *rows, "", "Inputs: privileged object state and the prompt."]) + "\n"
 
 
-# --- pictures ---
+# --- images ---
 
 
 def contact_sheet(videos: Sequence[Path]) -> Image.Image:
-    """Return a picture with one row per video: frames at even distances, the first and the last included."""
+    """Return an image with one row per video: frames at even distances, the first and the last included."""
     return Image.fromarray(np.concatenate([frames_row(video, COLUMN_WIDTH) for video in videos]))
 
 
 def strip(takes: Mapping[str, Take]) -> Image.Image:
-    """Return a picture with a row per video, as in `contact_sheet`, under its name and how the episode ended."""
+    """Return an image with a row per video, as in `contact_sheet`, under its name and how the episode ended."""
     rows = []
     for name, take in takes.items():
         row = frames_row(take.video, STRIP_WIDTH)

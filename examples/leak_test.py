@@ -116,7 +116,7 @@ def drawn_from(features: Mapping[str, Any]) -> Observe:
 
 
 def make_act() -> Any:
-    """Return a small ACT without pictures."""
+    """Return a small ACT without images."""
     from lerobot.policies.act.configuration_act import ACTConfig
     from lerobot.policies.act.modeling_act import ACTPolicy
 
@@ -125,7 +125,7 @@ def make_act() -> Any:
 
 
 def make_diffusion() -> Any:
-    """Return a small Diffusion Policy without pictures, which reads two observations."""
+    """Return a small Diffusion Policy without images, which reads two observations."""
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 

@@ -4,7 +4,7 @@
 
 The server sends its metadata when a client connects. Each frame after it is an observation, each answer holds the next
 chunk of actions (H, 7). ``prompt`` is the instruction; ``observation/NAME`` reaches the policy as ``observation.NAME``,
-a picture as ``observation.images.NAME``. A failure is answered by its traceback as text, and ends the connection.
+an image as ``observation.images.NAME``. A failure is answered by its traceback as text, and ends the connection.
 
 The policy serves one client at a time, since it has one memory. A connection begins an episode. Within one,
 ``observation/step`` (control steps since the episode began) begins another where it goes down. A policy that remembers

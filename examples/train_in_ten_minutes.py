@@ -2,7 +2,7 @@
 
     python examples/train_in_ten_minutes.py --out outputs/bowl
 
-Two CPU cores, no GPU, no pictures. The task: a demonstration prompt shows butter being put into one of three equal
+Two CPU cores, no GPU, no images. The task: a demonstration prompt shows butter being put into one of three equal
 bowls; afterwards all bowls look the same. `--smoke` runs the same in a minute, too short to learn.
 The same command resumes.
 """

@@ -56,7 +56,7 @@ class MemoryPolicyServer(LeRobotModelServer):
         self._episode = ""
 
     def get_observation_params(self) -> dict[str, Any]:
-        """Return the inputs that it needs, and the convention of pictures that its policy was trained on, if known."""
+        """Return the inputs that it needs, and the convention of images that its policy was trained on, if known."""
         stated = {} if self._convention is None else {STATED: self._convention}
         return {**super().get_observation_params(), **stated}
 

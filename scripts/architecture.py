@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src"
 PACKAGE = "lerobot_memobench"
 PLAN = ROOT / "docs" / "develop.md"
-PICTURE = ROOT / "docs" / "figures" / "architecture.svg"
+IMAGE = ROOT / "docs" / "figures" / "architecture.svg"
 
 Imports = Mapping[str, set[str]]
 """Module -> imported modules of this project, as dotted names; includes imports inside functions."""
@@ -142,7 +142,7 @@ def draw_arrow(axis: Any, name: str, start: tuple[float, float], end: tuple[floa
     axis.add_patch(arrow)
 
 
-def draw(picture: Path = PICTURE) -> None:
+def draw(image: Path = IMAGE) -> None:
     """Draw packages as boxes and direct imports as arrows."""
     import matplotlib
 
@@ -166,18 +166,18 @@ def draw(picture: Path = PICTURE) -> None:
     for here, targets in sorted(direct(found).items()):
         for target in sorted(targets):
             draw_arrow(axis, f"{here}-{target}", centres[here], centres[target])
-    figure.savefig(picture, metadata={"Date": None})
+    figure.savefig(image, metadata={"Date": None})
     plt.close(figure)
 
 
-def drawn(picture: Path = PICTURE) -> dict[str, set[str]]:
+def drawn(image: Path = IMAGE) -> dict[str, set[str]]:
     """Return the arrows of the SVG, from their ids."""
     found: dict[str, set[str]] = {}
-    for here, target in re.findall(r'id="(\w+)-(\w+)"', picture.read_text()):
+    for here, target in re.findall(r'id="(\w+)-(\w+)"', image.read_text()):
         found.setdefault(here, set()).add(target)
     return found
 
 
 if __name__ == "__main__":
     draw()
-    print(PICTURE.relative_to(ROOT))
+    print(IMAGE.relative_to(ROOT))

@@ -582,13 +582,13 @@ def slug(name: str) -> str:
 
 @cache
 def task_places() -> dict[str, tuple[int, int]]:
-    """Return the position of each task's picture in the sheet, name -> (left, top), pixels."""
+    """Return the position of each task's image in the sheet, name -> (left, top), pixels."""
     places: dict[str, tuple[int, int]] = runpy.run_path(str(ROOT / "scripts" / "gallery.py"))["task_places"]()
     return places
 
 
 def scene(number: int) -> bytes:
-    """Return the picture of a published task's initial scene, cropped from the sheet."""
+    """Return the image of a published task's initial scene, cropped from the sheet."""
     from PIL import Image
 
     from lerobot_memobench.tasks.catalogue import task_names

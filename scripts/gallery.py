@@ -1,7 +1,7 @@
 """Draw the initial scenes of a suite's tasks.
 
 python scripts/gallery.py                              # outputs/gallery/tasks.png
-python scripts/gallery.py --out docs/figures           # the picture in README
+python scripts/gallery.py --out docs/figures           # the image in README
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def draw_tasks(names: Sequence[str] | None = None, size: int = 256) -> Image.Ima
 
 
 def task_places(names: Sequence[str] | None = None, size: int = 256) -> dict[str, tuple[int, int]]:
-    """Return the position of each task's picture in `draw_tasks`, name -> (left, top), pixels."""
+    """Return the position of each task's image in `draw_tasks`, name -> (left, top), pixels."""
     places: dict[str, tuple[int, int]] = {}
     top = 0
     for memory_type, tasks in _by_type(names).items():
@@ -78,11 +78,11 @@ def _columns_and_label(names: Sequence[str] | None, size: int) -> tuple[int, int
 
 
 GAP = 6
-"""Between pictures, pixels."""
+"""Between images, pixels."""
 
 
 class Layout(NamedTuple):
-    """Lines of each label, (left, top) of each picture, and the size of the sheet, pixels."""
+    """Lines of each label, (left, top) of each image, and the size of the sheet, pixels."""
 
     labels: list[list[str]]
     places: list[tuple[int, int]]
@@ -90,9 +90,9 @@ class Layout(NamedTuple):
     height: int
 
 
-def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: int, heading: str) -> Layout:
-    """Return the layout of `grid` for pictures of equal size; the longest label of a row sets its height."""
-    width, height = picture
+def layout(names: Sequence[str], image: tuple[int, int], columns: int, label: int, heading: str) -> Layout:
+    """Return the layout of `grid` for images of equal size; the longest label of a row sets its height."""
+    width, height = image
     font = ImageFont.load_default(label)
     labels = [_wrapped(name, font, width) for name in names]
     top, places = GAP + (2 * (label + 3) if heading else 0), []
@@ -104,14 +104,14 @@ def layout(names: Sequence[str], picture: tuple[int, int], columns: int, label: 
 
 
 def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, heading: str = "") -> Image.Image:
-    """Return pictures of equal size in rows, each above its label, below an optional heading."""
+    """Return images of equal size in rows, each above its label, below an optional heading."""
     height, width = cells[0][1].shape[:2]
     placed = layout([name for name, _ in cells], (width, height), columns, label, heading)
     sheet = Image.new("RGB", (placed.width, placed.height), BACKGROUND)
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(label)
     draw.text((GAP, GAP), heading, fill=INK, font=ImageFont.load_default(round(1.3 * label)))
-    for (_, picture), lines, (x, y) in zip(cells, placed.labels, placed.places, strict=True):
-        sheet.paste(Image.fromarray(picture), (x, y))
+    for (_, image), lines, (x, y) in zip(cells, placed.labels, placed.places, strict=True):
+        sheet.paste(Image.fromarray(image), (x, y))
         for number, words in enumerate(lines):
             draw.text((x + 1, y + height + 2 + number * (label + 3)), words, fill=INK, font=font)
     return sheet

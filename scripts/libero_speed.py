@@ -20,7 +20,7 @@ import numpy as np
 
 SUITE, TASK_ID = "libero_spatial", 0
 TASK_COUNT, EPISODES, LIMIT = 10, 50, 280
-FIRST, RESET, STEP, STEP_WITHOUT = "construction and first reset", "reset", "step with two pictures", "step without"
+FIRST, RESET, STEP, STEP_WITHOUT = "construction and first reset", "reset", "step with two images", "step without"
 BLOCKS = {RESET: 1, STEP: 10, STEP_WITHOUT: 30}
 """Operation -> its repetitions in a turn."""
 TURNS = 3
@@ -75,9 +75,9 @@ def stock() -> Operations:
         envs.append(LiberoEnv(benchmark.get_benchmark_dict()[SUITE](), TASK_ID, SUITE, obs_type="pixels_agent_pos"))
         envs[0].reset(seed=7)
 
-    def draw(pictures: bool) -> None:
+    def draw(images: bool) -> None:
         for camera in ("agentview", "robot0_eye_in_hand"):
-            envs[0]._env.env.modify_observable(f"{camera}_image", "enabled", pictures)
+            envs[0]._env.env.modify_observable(f"{camera}_image", "enabled", images)
 
     def step() -> None:
         draw(True)

@@ -3,7 +3,7 @@
     pip download --no-deps robosuite==1.4.0
     python scripts/robosuite_arm.py robosuite-1.4.0-py3-none-any.whl            # --check compares the files instead
 
-robosuite composes the MJCF: Panda, RethinkMount, PandaGripper. OBJ files of the drawn meshes lose what pictures do not
+robosuite composes the MJCF: Panda, RethinkMount, PandaGripper. OBJ files of the drawn meshes lose what images do not
 depend on: texture coordinates, for which no material of the arm has a texture, repeated vertices and trailing zeros.
 Everything else is copied.
 """

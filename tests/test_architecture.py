@@ -126,10 +126,10 @@ def test_checks_detect_violations() -> None:
     assert list(private_uses(ast.parse(source), trees())) == [f"{PACKAGE}.io._to_disk", "world._x"]
 
 
-def test_picture_shows_current_imports() -> None:
+def test_image_shows_current_imports() -> None:
     found = architecture.direct(architecture.arrows(imports()))
     assert architecture.drawn() == {here: targets for here, targets in found.items() if targets}, (
-        "update the picture: python scripts/architecture.py"
+        "update the image: python scripts/architecture.py"
     )
 
 

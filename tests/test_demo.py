@@ -1,4 +1,4 @@
-"""`examples/demo.py`: its commands, and its pictures of evaluations, which are replaced here."""
+"""`examples/demo.py`: its commands, and its images of evaluations, which are replaced here."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def evaluate(demo: SimpleNamespace, words: list[str]) -> None:
     video(folder / "videos" / f"{demo.STRICT_TASK}.1.mp4", 6, 100)  # the first episode with different outcomes
 
 
-def test_demo_writes_pictures_and_table(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_demo_writes_images_and_table(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     commands: list[list[str]] = []
 
     def fake_run(command: list[str], **_: Any) -> None:
@@ -88,8 +88,8 @@ def test_demo_writes_pictures_and_table(demo: SimpleNamespace, tmp_path: Path, m
     assert (means[0] < 20, means[-1] > 235) == (True, True), "first and last frames are included"
 
 
-def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
-    return bool((picture == colour).all(axis=-1).any())
+def has_colour(image: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((image == colour).all(axis=-1).any())
 
 
 def test_joined_videos_show_outcomes(demo: SimpleNamespace, tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_joined_videos_show_outcomes(demo: SimpleNamespace, tmp_path: Path) -> N
     assert abs(float(right.mean()) - 200) < 4
     ends = [[has_colour(frame[: demo.TITLE], colour) for frame in frames] for colour in (demo.SOLVED, demo.FAILED)]
     assert [end.index(True) for end in ends] == [5 + LAST_FRAMES - 1, 9 + LAST_FRAMES - 1]
-    picture = np.asarray(demo.strip(takes))
-    assert picture.shape == (2 * (demo.TITLE + demo.STRIP_WIDTH * HEIGHT // WIDTH), 6 * demo.STRIP_WIDTH, 3)
-    assert has_colour(picture[: demo.TITLE], demo.SOLVED)
-    assert has_colour(picture[len(picture) // 2 :][: demo.TITLE], demo.FAILED)
+    image = np.asarray(demo.strip(takes))
+    assert image.shape == (2 * (demo.TITLE + demo.STRIP_WIDTH * HEIGHT // WIDTH), 6 * demo.STRIP_WIDTH, 3)
+    assert has_colour(image[: demo.TITLE], demo.SOLVED)
+    assert has_colour(image[len(image) // 2 :][: demo.TITLE], demo.FAILED)

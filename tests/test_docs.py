@@ -154,7 +154,7 @@ def test_navigation_lists_every_page_once() -> None:
     assert [url for url, count in urls.items() if count > 1] == []
 
 
-def test_pictures_of_copied_pages_are_in_the_site() -> None:
+def test_images_of_copied_pages_are_in_the_site() -> None:
     adapted = reference.relink("![rates](../docs/figures/study.png)", "results/study.md", "results/study.md")
     assert adapted == "![rates](../figures/study.png)"
 
@@ -516,10 +516,10 @@ def test_task_pages_have_a_card_per_task() -> None:
 
 
 @pytest.mark.parametrize("number", [1, 6, 20, 30])
-def test_task_pictures_are_cropped_at_their_edges(number: int) -> None:
+def test_task_images_are_cropped_at_their_edges(number: int) -> None:
     """The background of the sheet is nearly white."""
-    with Image.open(io.BytesIO(reference.scene(number))) as picture:
-        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    with Image.open(io.BytesIO(reference.scene(number))) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
     assert pixels.shape == (256, 256, 3)
     assert max(edge.mean() for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1])) < 230
 

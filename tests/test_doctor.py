@@ -117,13 +117,13 @@ def test_missing_video_decoder_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_scene_that_cannot_be_drawn_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctor.picture().status == "ok"
+    assert doctor.image().status == "ok"
 
     def broken(*_: object) -> None:
         raise RuntimeError("no such scene")
 
     monkeypatch.setattr(Simulation, "reset", broken)
-    finding = doctor.picture()
+    finding = doctor.image()
     assert (finding.status, finding.detail, bool(finding.fix)) == ("failed", "RuntimeError: no such scene", True)
 
 

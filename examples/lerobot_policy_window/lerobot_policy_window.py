@@ -83,7 +83,7 @@ class WindowPolicy(PreTrainedPolicy):
         width, self.actions = config.width, config.output_features["action"].shape[0]
         self.numbers = [key for key in (STATE, OBJECTS) if key in config.input_features]
         self.from_numbers = nn.Linear(sum(config.input_features[key].shape[0] for key in self.numbers), width)
-        self.from_pictures = nn.ModuleList(  # one for each camera; none where there are no pictures
+        self.from_images = nn.ModuleList(  # one for each camera; none where there are no images
             nn.Sequential(
                 *(nn.Conv2d(3, 16, 8, 4), nn.ReLU(), nn.Conv2d(16, 32, 4, 2), nn.ReLU()),
                 *(nn.AdaptiveAvgPool2d(4), nn.Flatten(), nn.Linear(32 * 16, width)),
@@ -104,7 +104,7 @@ class WindowPolicy(PreTrainedPolicy):
         tokens = self.from_numbers(torch.cat([batch[key] for key in self.numbers], -1)) + self.phase(
             batch[PHASE].long()
         )
-        for key, encode in zip(self.config.image_features, self.from_pictures, strict=True):
+        for key, encode in zip(self.config.image_features, self.from_images, strict=True):
             tokens = tokens + encode(batch[key].flatten(0, -4)).reshape(tokens.shape)
         return tokens
 

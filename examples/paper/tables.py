@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from published import RAW, PublishedRow, published_rows
 
 from lerobot_memobench.constants import BY_PAPER, EVALUATION_SEED, HORIZON
-from lerobot_memobench.envs.settings import PICTURES
+from lerobot_memobench.envs.settings import IMAGE_SETTINGS
 from lerobot_memobench.evaluation.comparison import NOTE
 from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.headline import headline
@@ -25,7 +25,7 @@ from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 SETTINGS = {
     **{"suite": PUBLISHED, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True},
-    **{"horizon": HORIZON, "seed_base": EVALUATION_SEED, **PICTURES},
+    **{"horizon": HORIZON, "seed_base": EVALUATION_SEED, **IMAGE_SETTINGS},
 }
 """Settings of the paper's evaluations."""
 TASKS, EPISODES = 30, 50

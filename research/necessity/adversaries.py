@@ -70,7 +70,7 @@ LOOKS = {
 }
 """Drawer -> position of the camera in the cabinet's frame (m), and first two axes of its hand there."""
 SHOWN_PIXELS = 40
-"""Pixels of an object from which a picture shows it."""
+"""Pixels of an object from which an image shows it."""
 SHOWN = "the clock, if it were shown"
 """The control of the strategy that reads the clock: it gets the elapsed steps, which no observation holds."""
 UNBOUND = (SHOWN,)
@@ -398,7 +398,7 @@ def peek(by: float, seat: Seat) -> Motion:
 
 
 def look_inside(seat: Seat) -> Motion:
-    """Put the wrist camera into shut drawers, open the one whose picture shows the object, or guess."""
+    """Put the wrist camera into shut drawers, open the one whose image shows the object, or guess."""
     name = _asked(seat)[0]
     for level in LOOKS:
         yield from _look(seat, level)

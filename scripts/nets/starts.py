@@ -36,7 +36,7 @@ def start(name: str, folder: Path) -> Facts:
 
     try:
         env, seeds = gymnasium.make(name, obs_type="both", disable_env_checker=True), SEEDS
-    except Exception:  # suites of LIBERO have pictures only
+    except Exception:  # suites of LIBERO have images only
         env, seeds = gymnasium.make(name, disable_env_checker=True), SEEDS[:1]
     found: Facts = {}
     for seed in seeds:

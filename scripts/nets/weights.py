@@ -1,4 +1,4 @@
-"""Net ``weights``: losses and weights after twelve updates of each memory, from objects and from pictures.
+"""Net ``weights``: losses and weights after twelve updates of each memory, from objects and from images.
 
 `lerobot train policy=memobench_mem size=small` on two demonstrations that the expert records here. Names of tensors are
 a fact of their own, so that a renamed module changes no other one. About 2 CPU minutes.

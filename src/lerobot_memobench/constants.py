@@ -1,4 +1,4 @@
-"""Constants of the benchmark: time, seeds, pictures, vectors (paper, section 5.1)."""
+"""Constants of the benchmark: time, seeds, images, vectors (paper, section 5.1)."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ SCENE_HASH_VERSION = 2
 1: release 0.2.0.
 """
 
-# -- pictures
+# -- images
 
 CAMERAS = {"image": "agentview", "wrist_image": "wrist"}
 """Name in observations and datasets (``observation.images.<name>``) → camera of the simulator."""
 IMAGE_SIZE = 256
-"""Height and width of a picture, pixels."""
+"""Height and width of an image, pixels."""
 
 # -- vectors
 

@@ -59,7 +59,7 @@ def examine() -> list[Finding]:
         plugin(),
         caches(),
         assets(),
-        picture(),
+        image(),
         video_decoding(),
         device(),
     ]
@@ -172,7 +172,7 @@ def assets() -> Finding:
     return Finding("assets", "ok", detail)
 
 
-def picture() -> Finding:
+def image() -> Finding:
     """Simulate and draw a scene."""
     try:
         from lerobot_memobench.sim.simulation import Simulation
@@ -182,8 +182,8 @@ def picture() -> Finding:
         height, width, _ = simulation.render("agentview").shape
     except Exception as error:
         fix = "fix the problems above first, or remove numba's files from the cache folder"
-        return Finding("picture", "failed", _in_one_line(error), fix)
-    return Finding("picture", "ok", f"a scene of {width} × {height} pixels, drawn on the CPU")
+        return Finding("image", "failed", _in_one_line(error), fix)
+    return Finding("image", "ok", f"a scene of {width} × {height} pixels, drawn on the CPU")
 
 
 def video_decoding() -> Finding:

@@ -39,7 +39,7 @@ except ImportError as error:
 logger = logging.getLogger(__name__)
 
 NAMES = {"image": ("agentview", "video_history"), "wrist_image": ("wrist", "wrist_video_history")}
-"""Camera -> the harness's names of its picture and of its video of the demonstration prompt."""
+"""Camera -> the harness's names of its image and of its video of the demonstration prompt."""
 DECIDED = {"seed_base": "seed", "prompt_in": "send_video_history", "obs_type": "send_state and send_wrist_image"}
 """Setting of `EnvSettings` -> the argument that determines it."""
 
@@ -50,7 +50,7 @@ class MEMOBench(StepBenchmark):
     Observation: ``images`` with ``agentview`` and ``wrist`` uint8 (H, W, 3); ``states`` float32 (8,): end-effector
     position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) and, with
     ``robot_state=True``, ``robot_state`` of `MemobenchEnv`. The first observation of an episode with a demonstration
-    prompt also contains ``video_history`` and ``wrist_video_history``, lists of pictures, ``state_history``, a list of
+    prompt also contains ``video_history`` and ``wrist_video_history``, lists of images, ``state_history``, a list of
     states, and ``episode_restart``. Frames of the rest between prompt and execution are omitted, because they equal the
     first observation.
 
@@ -72,7 +72,7 @@ class MEMOBench(StepBenchmark):
         send_video_history: whether the demonstration prompt is sent.
         log_dir: folder of the episode log for ``memobench report``; None for no log.
         label: name of the model server's policy in the log.
-        trained_convention: of the pictures that the server's policy was trained on: the ``convention``, or refused.
+        trained_convention: of the images that the server's policy was trained on: the ``convention``, or refused.
         settings: other fields of `EnvSettings`, such as ``suite``, ``referent``, ``horizon``, ``evidence`` or
             ``convention`` (``libero``: mirrored as the harness does for LIBERO). If the harness's ``max_steps`` is
             lower than the horizon, it ends episodes without a log line.
@@ -116,7 +116,7 @@ class MEMOBench(StepBenchmark):
             check_choice(STATED, trained_convention, [*CONVENTIONS])
             if (convention := settings.setdefault("convention", trained_convention)) != trained_convention:
                 raise MemobenchError(
-                    f"the model server expects pictures of convention={trained_convention}, and found convention="
+                    f"the model server expects images of convention={trained_convention}, and found convention="
                     f"{convention}; leave it out"
                 )
         planned, prompt_in = replan_steps or n_action_steps, STEPS if send_video_history else RESET
@@ -163,7 +163,7 @@ class MEMOBench(StepBenchmark):
             step, shows = int(observation["step"][0]), not self._env.episode.idling
             if shows and step % self._history_every == 0:
                 for name in self._cameras:
-                    self._history.setdefault(NAMES[name][1], []).append(self._picture(observation, name))
+                    self._history.setdefault(NAMES[name][1], []).append(self._image(observation, name))
                 if self._send_state:
                     self._history.setdefault("state_history", []).append(observation["agent_pos"])
             self._env.need_observation(shows and (step + 1) % self._history_every == 0)
@@ -201,7 +201,7 @@ class MEMOBench(StepBenchmark):
     def make_obs(self, raw_obs: dict[str, Any], task: dict[str, Any]) -> dict[str, Any]:
         """Return the observation to send; the first one contains the prompt."""
         sent: dict[str, Any] = {
-            "images": {NAMES[name][0]: self._picture(raw_obs, name) for name in self._cameras},
+            "images": {NAMES[name][0]: self._image(raw_obs, name) for name in self._cameras},
             "task_description": self._running().task_description,
             "step": raw_obs["step"],
         }
@@ -214,9 +214,9 @@ class MEMOBench(StepBenchmark):
             self._history = {}
         return sent
 
-    def _picture(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
-        picture: NDArray[np.uint8] = observation["pixels"][self._settings.pictures[name]]
-        return picture
+    def _image(self, observation: dict[str, Any], name: str) -> NDArray[np.uint8]:
+        image: NDArray[np.uint8] = observation["pixels"][self._settings.images[name]]
+        return image
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         """Return success and the episode's MSR, MUR and MCR; see the class."""
@@ -244,9 +244,9 @@ class MEMOBench(StepBenchmark):
 
     def get_observation_spec(self) -> dict[str, specs.DimSpec]:
         """Return the conventions of the observation."""
-        pictures = {NAMES[name][0]: specs.IMAGE_RGB for name in self._cameras}
+        images = {NAMES[name][0]: specs.IMAGE_RGB for name in self._cameras}
         return {
-            **pictures,
+            **images,
             "language": specs.LANGUAGE,
             **({"state": specs.STATE_EEF_POS_AA_GRIP} if self._send_state else {}),
         }

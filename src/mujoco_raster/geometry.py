@@ -74,7 +74,7 @@ def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: A
                 total = matrix[line, 0] * table[row, 0, j] + matrix[line, 1] * table[row, 1, j]
                 total += matrix[line, 2] * table[row, 2, j]
                 m[k, j] = total + matrix[line, 3] if j == 3 else total
-        clip.visible[row] = _in_picture(m, shapes.centre[row], shapes.half[row], near)
+        clip.visible[row] = _in_image(m, shapes.centre[row], shapes.half[row], near)
         if not clip.visible[row]:
             continue
         a, b, c, d = m[0, 0], m[0, 1], m[0, 2], m[0, 3]
@@ -88,7 +88,7 @@ def _project(shapes: Any, rows: Any, table: Any, matrix: Any, near: Any, clip: A
 
 
 @compiled
-def _in_picture(m: Any, centre: Any, half: Any, near: Any) -> Any:
+def _in_image(m: Any, centre: Any, half: Any, near: Any) -> Any:
     """Return whether a box may be in the image: not entirely beyond one side of the view volume."""
     for side in range(5):
         axis = side // 2

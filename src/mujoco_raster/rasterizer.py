@@ -22,7 +22,7 @@ from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
 from mujoco_raster.errors import RasterError
 from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles
 from mujoco_raster.highlights import Highlight, fill_table, table_of, with_discs
-from mujoco_raster.shading import PICTURE, TRANSLUCENT, Surfaces, scratch, shade
+from mujoco_raster.shading import IMAGE, TRANSLUCENT, Surfaces, scratch, shade
 from mujoco_raster.textures import LAYER_SIZE, levels_of
 from mujoco_raster.view import Camera, Lights, SceneLights, camera_matrix, clipping, cropped, mirrored, model_camera
 
@@ -111,7 +111,7 @@ class Rasterizer:
             self._draw_sky(view, image)
             view.draw_triangles(rows[opaque])
             behind = self._target.triangle
-        view.shade(PICTURE, image)
+        view.shade(IMAGE, image)
         if self._list.mirror is not None:
             shown = np.where(self._target.triangle >= 0, self._target.triangle, behind)
             self._add_reflection(view, self._list.mirror, rows[opaque], shown, image)
@@ -184,7 +184,7 @@ class Rasterizer:
         self._clear()
         if len(self._sky):
             view.draw_triangles(self._sky)
-            view.shade(PICTURE, image)
+            view.shade(IMAGE, image)
             self._clear()
 
     def _clear(self) -> None:
@@ -210,7 +210,7 @@ class Rasterizer:
         image = np.zeros((self._height, self._width, 3), np.uint8)
         self._draw_sky(view, image)
         view.draw_triangles(rows)
-        view.shade(PICTURE, image)
+        view.shade(IMAGE, image)
         return Background(image, self._target.depth.copy(), self._target.triangle.copy())
 
     # --- reflections ----------------------------------------------------------------------------------------
@@ -233,7 +233,7 @@ class Rasterizer:
         self._table[:, 3, :3] *= mirror.reflectance
         other.draw_triangles(self._reach_above(rows[~np.isin(rows, mirror.rows)], point, normal))
         other.target.triangle[~seen] = -1
-        other.shade(PICTURE, reflection)
+        other.shade(IMAGE, reflection)
         self._table[:, 3, :3] = colours
         # The reflection is black outside the mirror.
         image[part] = np.minimum(image[part].astype(np.uint16) + reflection[:, ::-1], 255)

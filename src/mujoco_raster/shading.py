@@ -24,7 +24,7 @@ these loops, because numba checks signed ones for negative values, which prevent
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 5
 """Attributes per vertex: light (3), texture coordinates (2)."""
-PICTURE, TRANSLUCENT = 0, 1
+IMAGE, TRANSLUCENT = 0, 1
 """Output modes: write the image, blend over the image."""
 
 # Float rows of a batch: the attributes, followed by
@@ -107,7 +107,7 @@ def shade(
         lights: `lights.Lights`.
         eye: position of the camera, (3,).
         work: `Scratch`.
-        mode: `PICTURE` or `TRANSLUCENT`.
+        mode: `IMAGE` or `TRANSLUCENT`.
         image: (H * W, 3) uint8, updated.
     """
     height, width = target.triangle.shape
@@ -415,7 +415,7 @@ def _colour(textured: Any, texels: Any, side: Any, t: Any, i: Any) -> None:
 @compiled
 def _write(count: Any, mode: Any, alpha: Any, image: Any, t: Any, i: Any) -> None:
     """Write the first ``count`` pixels of a batch to the output of the mode."""
-    if mode == PICTURE:
+    if mode == IMAGE:
         for x in range(3 * STRIDE):
             t[x] = min(max(t[x], _0), _255) + _HALF
         for k in range(count):

@@ -31,11 +31,11 @@ def layers_of(model: mujoco.MjModel, *, sky: bool = False) -> tuple[NDArray[np.u
     for texture in range(model.ntex):
         if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX and not (sky and texture == skybox_of(model)):
             continue
-        for picture in _pictures(model, texture, pixels_of(model, texture)):
-            content = picture.tobytes()
+        for image in _images(model, texture, pixels_of(model, texture)):
+            content = image.tobytes()
             if content not in known:
                 known[content] = len(layers)
-                layers.append(resized(picture))
+                layers.append(resized(image))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
     return np.stack(layers), layer_of
 
@@ -71,16 +71,16 @@ def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
     return np.round(255 * linear).astype(np.uint8)[pixels]
 
 
-def resized(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def resized(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an image resized to the layer size."""
     from PIL import Image
 
-    if picture.shape[:2] == (LAYER_SIZE, LAYER_SIZE):
-        return picture
-    return np.asarray(Image.fromarray(picture).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC))
+    if image.shape[:2] == (LAYER_SIZE, LAYER_SIZE):
+        return image
+    return np.asarray(Image.fromarray(image).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC))
 
 
-def _pictures(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
+def _images(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
     """Return the image of a flat texture, or the six images of a cube, which may be a single one repeated."""
     if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D:
         return [pixels]

@@ -374,7 +374,7 @@ def test_outcomes_do_not_depend_on_batches_parts_and_kills(
 
 @linux
 @pytest.mark.slow
-def test_a_generation_with_pictures_and_workers_is_killed_and_continued(tmp_path: Path) -> None:
+def test_a_generation_with_images_and_workers_is_killed_and_continued(tmp_path: Path) -> None:
     words = ["-m", COMMANDS["memobench"], "generate", "--tasks", STOVE, "--episodes", "3", "--workers", "2", "--out"]
     began = time.monotonic()
     subprocess.run([sys.executable, *words, str(tmp_path / "whole")], check=True, capture_output=True)

@@ -39,15 +39,15 @@ def traces(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture(scope="session")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Streams of object state, without pictures, so that no video is decoded."""
+    """Streams of object state, without images, so that no video is decoded."""
     from lerobot_memobench.conformance.streams import write_streams
 
-    return write_streams(tmp_path_factory.mktemp("streams") / "objects", pictures=False, frames=13)
+    return write_streams(tmp_path_factory.mktemp("streams") / "objects", images=False, frames=13)
 
 
 @pytest.fixture(scope="session")
-def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Streams with pictures of the real size."""
+def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Streams with images of the real size."""
     from lerobot_memobench.conformance.streams import write_streams
 
-    return write_streams(tmp_path_factory.mktemp("streams") / "pictures", frames=13)
+    return write_streams(tmp_path_factory.mktemp("streams") / "images", frames=13)

@@ -249,7 +249,7 @@ def test_errors_of_the_policy_fail_checks(window: Subject, monkeypatch: pytest.M
         Behaviour(window)
 
 
-# --- on pictures of the real size: LeRobot's policies, ours, the example ---
+# --- on images of the real size: LeRobot's policies, ours, the example ---
 
 ACT = (
     *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
@@ -268,8 +268,8 @@ ACT = (
     ],
     ids=["act", "memobench_strict", "memobench_strict_memoryless"],
 )
-def test_known_policies_fail_known_checks(words: tuple[str, ...], wrong: list[str], pictures: Path) -> None:
-    results = run_checks(load_subject([*words, f"dataset={pictures}"], pictures.parent))
+def test_known_policies_fail_known_checks(words: tuple[str, ...], wrong: list[str], images: Path) -> None:
+    results = run_checks(load_subject([*words, f"dataset={images}"], images.parent))
     assert [result.check for result in results if result.outcome is FAILED] == wrong, results
     assert not [result for result in results if result.outcome is NOT_CHECKED]
 
@@ -303,7 +303,7 @@ def test_wrong_settings_are_named(
 
 
 def test_memory_of_another_package_runs_an_episode(traces: None) -> None:
-    """Frames of pictures are stored in bfloat16, and its weights are float32."""
+    """Frames of images are stored in bfloat16, and its weights are float32."""
     config = MemobenchMemConfig(device="cpu", size="tiny", memory="traces")
     assert config.memory_settings == {"traces": 4}
     memory = MemoryPI05(config).memory
@@ -322,7 +322,7 @@ def test_strides_that_an_interval_divides_conform(
     example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At a multiple of the interval, each plan reads frames of earlier plans alone; a flaw is found all the same."""
-    data = write_streams(tmp_path / "streams", pictures=False)
+    data = write_streams(tmp_path / "streams", images=False)
     words = ["policy=window", "policy.width=16", "policy.frames=8", "policy.stride=15", f"dataset={data}"]
     subject = load_subject(words, tmp_path)
     check = "remembers every control step"
@@ -343,7 +343,7 @@ def test_strides_that_an_interval_divides_conform(
 
 
 def test_inputs_are_found(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A new policy may read pictures or objects; what both lack is named in a sentence."""
+    """A new policy may read images or objects; what both lack is named in a sentence."""
     from lerobot_policy_window import OBJECTS, WindowPolicy
 
     data = write_streams(tmp_path / "streams", frames=4)

@@ -52,11 +52,11 @@ def test_trained_example_conforms(example: Path, objects: Path, tmp_path: Path) 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["guides/memory_policy.md", "develop/add_a_memory_mechanism.md"])
 def test_commands_of_the_pages_run_in_their_order(
-    page: str, example: Path, traces: None, pictures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: str, example: Path, traces: None, images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fixtures install the packages, the demonstrations are short; another test runs the command of pytest."""
     programs = {"lerobot": main, "memobench": memobench.main}
-    shutil.copytree(pictures, tmp_path / "outputs" / "demonstrations")
+    shutil.copytree(images, tmp_path / "outputs" / "demonstrations")
     monkeypatch.chdir(tmp_path)
     typed = list(commands(ROOT / "docs" / page))
     assert {program for program, *_ in typed} <= {"pip", "python", *programs}

@@ -18,7 +18,7 @@ from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Checkpoint, Task
-from tests.support.short_demonstrations import drawn_steps, record_demonstration, with_pictures
+from tests.support.short_demonstrations import drawn_steps, record_demonstration, with_images
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
 BUTTER = "put_the_butter_into_the_bowl_from_the_prompt_video"
@@ -141,7 +141,7 @@ def synthetic(demos: list[Demonstration], tmp_path_factory: pytest.TempPathFacto
 @pytest.fixture(scope="session")
 def shown() -> list[Demonstration]:
     """Two short episodes of the simulator with images; the second one is perturbed."""
-    first, second = (with_pictures(drawn_steps(BUTTER, seed, FRAMES, 2), 32) for seed in (10_000, 10_001))
+    first, second = (with_images(drawn_steps(BUTTER, seed, FRAMES, 2), 32) for seed in (10_000, 10_001))
     return [first, replace(second, executed=second.actions, actions=second.actions * np.float32(0.5))]
 
 

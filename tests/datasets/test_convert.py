@@ -34,7 +34,7 @@ from lerobot_memobench.tasks.catalogue import get_task
 from tests.datasets.conftest import BUTTER, STOVE
 from tests.support.kills import hashes, killed_at
 from tests.support.published_files import write_foreign, write_published
-from tests.support.short_demonstrations import beginning, drawn_steps, record_demonstration, with_pictures
+from tests.support.short_demonstrations import beginning, drawn_steps, record_demonstration, with_images
 
 POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0b' * 32}\nsize 48213\n"
 
@@ -42,12 +42,12 @@ POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'0b' * 32}\n
 @pytest.fixture(scope="module")
 def short():
     """A few steps, some of them of a prompt."""
-    return with_pictures(drawn_steps(BUTTER, 10_000, 12, 4), 128)
+    return with_images(drawn_steps(BUTTER, 10_000, 12, 4), 128)
 
 
 @pytest.fixture(scope="module")
 def begun(stove):
-    return with_pictures(beginning(stove, 20), 128)
+    return with_images(beginning(stove, 20), 128)
 
 
 def restored_exactly(demo: Demonstration) -> Demonstration:
@@ -199,12 +199,12 @@ def test_files_that_cannot_be_opened(path, tmp_path):
             PublishedFile(path)
 
 
-# --- conventions of pictures ---
+# --- conventions of images ---
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS)
 @pytest.mark.parametrize("stored", ORIENTATIONS)
-def test_the_first_picture_decides_the_orientation(short, tmp_path, stored, convention):
+def test_the_first_image_decides_the_orientation(short, tmp_path, stored, convention):
     rows, columns = ORIENTATIONS[stored]
     turned = replace(short, images={name: images[:, ::rows, ::columns] for name, images in short.images.items()})
     path = write_published(tmp_path / "short_demo.hdf5", [turned])
@@ -217,8 +217,8 @@ def test_the_first_picture_decides_the_orientation(short, tmp_path, stored, conv
     )
 
 
-def test_pictures_unlike_the_scene_are_noted(short, tmp_path):
-    """Without a near picture, nothing is turned."""
+def test_images_unlike_the_scene_are_noted(short, tmp_path):
+    """Without a near image, nothing is turned."""
     grey = {name: np.full_like(images, 128) for name, images in short.images.items()}
     mixed = {**short.images, "wrist_image": short.images["wrist_image"][:, ::-1]}
     for name, images in (("grey", grey), ("mixed", mixed)):
@@ -243,7 +243,7 @@ def test_a_scene_that_cannot_be_built_is_left_out(written, tmp_path, monkeypatch
 
 
 def test_a_dataset_states_its_convention(short, tmp_path):
-    """By the names of its columns, in their description, its manifest and its card; replay agrees with its pictures."""
+    """By the names of its columns, in their description, its manifest and its card; replay agrees with its images."""
     path = write_published(tmp_path / "short_demo.hdf5", [short])
     for convention, wrist in (("upright", "wrist_image"), ("libero", "image2")):
         folder = tmp_path / convention
@@ -260,7 +260,7 @@ def test_a_dataset_states_its_convention(short, tmp_path):
         frames = {name: frame_reader(folder, name)(0, [3])[0].permute(1, 2, 0).numpy() * 255 for name in cameras}
         for camera, frame in zip(("image", "wrist_image"), frames.values(), strict=True):
             true = short.images[camera][3].astype(float)
-            apart = [np.abs(frame - picture).mean() for picture in (true, true[:, ::-1])]
+            apart = [np.abs(frame - image).mean() for image in (true, true[:, ::-1])]
             assert min(apart) < 8
             assert (apart[0] < apart[1]) == (convention == "upright")
         direct = write_dataset([short], tmp_path / f"direct {convention}", convention=convention)

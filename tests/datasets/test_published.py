@@ -19,7 +19,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import Simulation
 from tests.support import libero_layout
-from tests.support.short_demonstrations import drawn_steps, with_pictures
+from tests.support.short_demonstrations import drawn_steps, with_images
 
 DRAWER = "check_the_middle_drawer_of_the_cabinet"
 MILK = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
@@ -42,13 +42,13 @@ def drawer() -> Demonstration:
         objects.append(look.observe())
     satisfied = np.arange(20)[:, None] >= SHUT
     whole = replace(demo, states=states, proprio=np.array(proprio), objects=np.array(objects), satisfied=satisfied)
-    return with_pictures(whole, 16)
+    return with_images(whole, 16)
 
 
 def grey(demo: Demonstration) -> Demonstration:
     """Return a demonstration with grey images."""
-    picture = np.full((len(demo), 16, 16, 3), 128, np.uint8)
-    return replace(demo, images={"image": picture, "wrist_image": picture})
+    image = np.full((len(demo), 16, 16, 3), 128, np.uint8)
+    return replace(demo, images={"image": image, "wrist_image": image})
 
 
 def first(path: Path) -> tuple[PublishedFile, PublishedDemo]:

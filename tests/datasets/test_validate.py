@@ -134,13 +134,13 @@ def test_other_images_are_found(simulated, copy, camera, frames, first):
     folder = copy(simulated)
     image, wrist = (next((folder / "videos" / image_key(name)).rglob("*.mp4")) for name in ("image", "wrist_image"))
     path = image if camera == "image" else wrist
-    pictures = decoded(path)
-    assert len(pictures) == 2 * FRAMES
+    frames_in_file = decoded(path)
+    assert len(frames_in_file) == 2 * FRAMES
     if frames == "other episode":
-        pictures = np.roll(pictures, FRAMES, axis=0)
+        frames_in_file = np.roll(frames_in_file, FRAMES, axis=0)
     else:
-        pictures[frames] = 0
-    encode_video(pictures, path)
+        frames_in_file[frames] = 0
+    encode_video(frames_in_file, path)
     assert difference(folder, images=True).startswith(f"{image_key(camera)} at frame {first}: recorded 'an image")
 
 

@@ -1,4 +1,4 @@
-"""Pictures upright or as LIBERO's: environment, gymnasium, LeRobot's configuration, log, headline and comparison."""
+"""Images upright or as LIBERO's: environment, gymnasium, LeRobot's configuration, log, headline and comparison."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_libero_mirrors_and_names_what_the_policy_gets() -> None:
     assert tuple(first["pixels"]) == NAMES
 
 
-def test_liberos_names_mean_liberos_pictures() -> None:
+def test_liberos_names_mean_liberos_images() -> None:
     for given in ({}, {"convention": "libero"}):
         config = MemobenchEnvConfig(camera_name_mapping=MAPPING, **given)
         assert (config.convention, config.settings.convention) == ("libero", "libero")
@@ -72,8 +72,8 @@ def test_liberos_names_mean_liberos_pictures() -> None:
     [
         ({"convention": "liberoo"}, "did you mean 'libero'"),
         ({"control_mode": "absolute"}, "control_mode is 'absolute'"),
-        ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of pictures"),
-        ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of pictures"),
+        ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of images"),
+        ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of images"),
         ({"convention": "upright", "camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
         *(
             (
@@ -100,8 +100,8 @@ def test_refused_settings(settings: dict[str, Any], named: str) -> None:
 
 
 @pytest.mark.parametrize("render", ["default", "high"])
-def test_sizes_of_pictures(tmp_path: Path, render: str) -> None:
-    """Also not square: a narrower picture is the middle of a wider one. Video and spaces follow."""
+def test_sizes_of_images(tmp_path: Path, render: str) -> None:
+    """Also not square: a narrower image is the middle of a wider one. Video and spaces follow."""
     small = {"observation_height": 16, "observation_width": 16}
     sizes = {"observation_height": 96, "observation_width": 64, "render": render}
     config = MemobenchEnvConfig(**sizes)
@@ -111,10 +111,10 @@ def test_sizes_of_pictures(tmp_path: Path, render: str) -> None:
     wide = opened(horizon=1, **sizes | {"observation_width": 96})
     (first, _), (other, _) = (env.reset(seed=20_000) for env in (narrow, wide))
     assert narrow.observation_space.contains(first)
-    for name, picture in first["pixels"].items():
+    for name, image in first["pixels"].items():
         middle = other["pixels"][name][:, 16:80]
-        assert picture.shape == middle.shape == (96, 64, 3)
-        assert np.abs(picture.astype(int) - middle).mean() < 0.5
+        assert image.shape == middle.shape == (96, 64, 3)
+        assert np.abs(image.astype(int) - middle).mean() < 0.5
     narrow.step(REST)
     other = opened(horizon=1, **small)
     other.reset(seed=20_000)
@@ -123,15 +123,15 @@ def test_sizes_of_pictures(tmp_path: Path, render: str) -> None:
         assert (video.streams.video[0].height, video.streams.video[0].width) == (BAND + 96, 2 * 64)
 
 
-def test_camera_name_mapping_names_the_pictures(tmp_path: Path) -> None:
+def test_camera_name_mapping_names_the_images(tmp_path: Path) -> None:
     """As in LeRobot's libero: in its features, in observations, and through the parser of its commands."""
     wrist = {"robot0_eye_in_hand_image": "wrist"}
     for given, names in ((MAPPING, ("camera1", "camera2")), (wrist, ("image", "wrist"))):
         flags = ["--convention=libero", f"--camera_name_mapping={json.dumps(given)}"]
         config = draccus.parse(MemobenchEnvConfig, args=flags)
         features = env_to_policy_features(config)
-        pictures = [key for key, one in features.items() if one.type is FeatureType.VISUAL]
-        assert pictures == [f"observation.images.{name}" for name in names]
+        images = [key for key, one in features.items() if one.type is FeatureType.VISUAL]
+        assert images == [f"observation.images.{name}" for name in names]
         env = MemobenchEnv(STOVE, config.settings, log_dir=str(tmp_path / names[0]), horizon=1)
         observed, _ = env.reset(seed=7)
         assert env.observation_space.contains(observed)
@@ -170,7 +170,7 @@ def test_robot_state_is_that_of_lerobots_libero() -> None:
     env.close()
 
 
-def test_log_file_headline_and_comparison_name_pictures(tmp_path: Path) -> None:
+def test_log_file_headline_and_comparison_name_images(tmp_path: Path) -> None:
     sizes = {"observation_height": 128, "observation_width": 96}
     for name, settings in {"upright": {}, "libero": {"convention": "libero"} | sizes}.items():
         env = MemobenchEnv(STOVE, log_dir=str(tmp_path / name), horizon=1, **settings)

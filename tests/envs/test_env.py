@@ -341,7 +341,7 @@ def test_failed_video_leaves_the_log_whole(tmp_path: Path, monkeypatch: pytest.M
     """The episode of the failed video is not logged, so resuming runs it again."""
     env = make(log_dir=str(tmp_path), videos=-1, horizon=2)
 
-    def no_room(video: VideoRecorder, picture: Any) -> None:
+    def no_room(video: VideoRecorder, image: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     play(env, 20_007, 2)

@@ -65,8 +65,8 @@ def test_observation_at_home_is_the_same_after_an_event(name: str, rounds: int) 
         assert moved
         env.need_observation(True)
         seen, *_ = env.step(np.array([0, 0, 0, 0, 0, 0, -1], np.float32))
-        for camera, picture in first["pixels"].items():
-            np.testing.assert_array_equal(seen["pixels"][camera], picture)
+        for camera, image in first["pixels"].items():
+            np.testing.assert_array_equal(seen["pixels"][camera], image)
         for part in set(first) - {"pixels"}:
             np.testing.assert_equal(seen[part], first[part], err_msg=part)
     env.close()
@@ -171,7 +171,7 @@ STROKES, STROKE_STEPS = 6, 10
 @pytest.mark.usefixtures("short_holds")
 @pytest.mark.parametrize("name", task_names(suite=STRICT))
 def test_variants_are_the_same_under_random_actions_until_a_hiding_drawer_opens(name: str) -> None:
-    """Physics, object slots and pictures, bit for bit."""
+    """Physics, object slots and images, bit for bit."""
     task = get_task(name)
     prompts = [task.variant(variant).prompt for variant in range(task.num_variants)]
     hiding = {drawer for prompt in prompts if prompt is not None for _, drawer in prompt.places}

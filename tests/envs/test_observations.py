@@ -26,7 +26,7 @@ from lerobot_memobench.sim.object_layout import SIZE
 
 STATE = {"observation.state": PolicyFeature(FeatureType.STATE, (8,))}
 SLOTS = {"observation.environment_state": PolicyFeature(FeatureType.ENV, (SIZE,))}
-PICTURE = {"observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 256, 256))}
+IMAGE = {"observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 256, 256))}
 POSES = "privileged object state"
 
 
@@ -41,11 +41,11 @@ def memory(**settings: Any) -> MemobenchMemConfig:
 @pytest.mark.parametrize(
     ("policy", "obs_type", "inputs"),
     [
-        (config(ACTConfig, STATE, PICTURE), BOTH, "pixels"),
-        (config(ACTConfig, STATE, PICTURE, SLOTS), BOTH, f"pixels, {POSES}"),
+        (config(ACTConfig, STATE, IMAGE), BOTH, "pixels"),
+        (config(ACTConfig, STATE, IMAGE, SLOTS), BOTH, f"pixels, {POSES}"),
         (config(ACTConfig, STATE, SLOTS), OBJECTS, POSES),
         (config(ACTConfig), BOTH, f"pixels, {POSES}"),  # before training: everything
-        (config(PI05Config, STATE, PICTURE, SLOTS), BOTH, "pixels"),  # it ignores object slots
+        (config(PI05Config, STATE, IMAGE, SLOTS), BOTH, "pixels"),  # it ignores object slots
         (memory(), PIXELS, "pixels"),
         (memory(perception="objects", detector="package"), PIXELS, "detections"),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
@@ -91,7 +91,7 @@ def test_observation_kind_must_contain_the_inputs(policy: Any, needed: str | Non
                 check_obs_type(policy, obs_type)
 
 
-def test_a_picture_may_be_changed_in_place() -> None:
+def test_a_image_may_be_changed_in_place() -> None:
     """A scene at rest is rendered once, and each observation has arrays of its own."""
     observer = Observer(DEFAULTS)
     observer._images = {name: np.ones((2, 2, 3), np.uint8) for name in CAMERAS}

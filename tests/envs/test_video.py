@@ -26,8 +26,8 @@ def encoded_directly(path: Path, frames: list[np.ndarray]) -> bytes:
     container = av.open(str(path), "w", format="mp4")
     stream = container.add_stream("libx264", rate=20, options={"preset": "ultrafast", "crf": "20", "threads": "1"})
     stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], "yuv420p"
-    for picture in [*frames, *[frames[-1]] * LAST_FRAMES]:
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+    for image in [*frames, *[frames[-1]] * LAST_FRAMES]:
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
     container.mux(stream.encode())
     container.close()
     return path.read_bytes()
@@ -39,16 +39,16 @@ def test_video_equals_direct_encoding(tmp_path: Path, count: int, width: int) ->
     noise = np.random.default_rng(0).integers(0, 256, (2, count, 64, width, 3), np.uint8)
     recorders = [VideoRecorder(tmp_path / "videos" / f"task.{number}.mp4") for number in range(2)]
     buffer = np.empty((64, width, 3), np.uint8)
-    for pictures in noise.swapaxes(0, 1):
-        for recorder, picture in zip(recorders, pictures, strict=True):
-            buffer[:] = picture
+    for images in noise.swapaxes(0, 1):
+        for recorder, image in zip(recorders, images, strict=True):
+            buffer[:] = image
             recorder.add(buffer)
     buffer[:] = 0
     assert not list(tmp_path.rglob("task*.mp4"))
-    for number, (recorder, pictures) in enumerate(zip(recorders, noise, strict=True)):
+    for number, (recorder, images) in enumerate(zip(recorders, noise, strict=True)):
         path = recorder.finish()
         assert path == tmp_path / "videos" / f"task.{number}.mp4"
-        assert path.read_bytes() == encoded_directly(tmp_path / "direct.mp4", list(pictures))
+        assert path.read_bytes() == encoded_directly(tmp_path / "direct.mp4", list(images))
     assert len(list((tmp_path / "videos").iterdir())) == 2
 
 
@@ -62,7 +62,7 @@ def test_unfinished_and_empty_videos_leave_no_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-# --- text over the pictures ---
+# --- text over the images ---
 
 
 def moment(name: str, phase: int = EXECUTION, step: int = 0, done: int = 0, **changes: Any) -> SimpleNamespace:
@@ -79,8 +79,8 @@ def moment(name: str, phase: int = EXECUTION, step: int = 0, done: int = 0, **ch
     )
 
 
-def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
-    return bool((picture == colour).all(axis=2).any())
+def has_colour(image: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((image == colour).all(axis=2).any())
 
 
 def test_frame_shows_cameras_checkpoints_and_clock(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -162,7 +162,7 @@ def test_contents_of_observations_and_specs(benchmarks: Make) -> None:
     sizes, names = {"observation_height": 96, "observation_width": 64}, {"agentview_image": "camera1"}
     other = benchmarks(UNPROMPTED, horizon=1, convention="libero", camera_name_mapping=names, robot_state=True, **sizes)
     asked, _ = played(other)
-    assert {name: picture.shape for name, picture in asked["images"].items()} == {
+    assert {name: image.shape for name, image in asked["images"].items()} == {
         "agentview": (96, 64, 3),
         "wrist": (96, 64, 3),
     }
@@ -207,11 +207,11 @@ def test_the_server_states_the_convention_of_its_policy(benchmarks: Make) -> Non
     server.get_observation_params = lambda: {"trained_convention": "libero"}  # type: ignore[method-assign]
     with vla_eval.serve_background(server) as handle:
         by_harness(handle.url, tasks=[UNPROMPTED], horizon=1)
-        pictures = server.heard[0][2]["images"]
-        with pytest.raises(MemobenchError, match="expects pictures of convention=libero, and found convention=upright"):
+        images = server.heard[0][2]["images"]
+        with pytest.raises(MemobenchError, match="expects images of convention=libero, and found convention=upright"):
             by_harness(handle.url, tasks=[UNPROMPTED], horizon=1, convention="upright")
     first, _ = played(benchmarks(UNPROMPTED, horizon=1))
-    assert all(np.array_equal(pictures[name], first["images"][name][:, ::-1]) for name in ("agentview", "wrist"))
+    assert all(np.array_equal(images[name], first["images"][name][:, ::-1]) for name in ("agentview", "wrist"))
     assert MEMOBench(trained_convention="upright").get_tasks()
     with pytest.raises(MemobenchError, match="did you mean 'libero'"):
         MEMOBench(trained_convention="liberu")

@@ -119,8 +119,8 @@ def shown_frame(browser: Any, video: str) -> int:
     from PIL import Image
 
     box = browser.box(video)
-    picture = Image.open(browser.screenshot(Path(browser._log.name).with_suffix(".png")))
-    grey = picture.convert("L").getpixel((int(box["x"] + box["width"] / 2), int(box["y"] + box["height"] / 2)))
+    image = Image.open(browser.screenshot(Path(browser._log.name).with_suffix(".png")))
+    grey = image.convert("L").getpixel((int(box["x"] + box["width"] / 2), int(box["y"] + box["height"] / 2)))
     return round((grey - 16) / 4)
 
 
@@ -242,7 +242,7 @@ def test_prompt_failure_and_memory_reads(browser: Any, report: Path) -> None:
     assert browser.texts("#tip")[0].startswith("Prompt step 8")
     browser.wait("document.querySelector('#tip video')?.readyState >= 2")
     settle(browser)
-    assert_shown(browser, 8, "#tip .picture")
+    assert_shown(browser, 8, "#tip .image")
     browser.click(".cell:nth-child(2)")
     assert playhead(browser) == 8
     show(browser, report, f"view=episodes&ep={BUTTER}.1")

@@ -30,7 +30,7 @@ KINDS, CELLS = 3, 2 * GRID
 
 @pytest.fixture(autouse=True)
 def same_weights() -> None:
-    """Let weights and pictures be drawn alike each time."""
+    """Let weights and images be drawn alike each time."""
     torch.manual_seed(0)
 
 
@@ -72,7 +72,7 @@ def test_uncertainties_are_of_the_image_and_of_metres() -> None:
         assert things["uncertainty"] == pytest.approx(np.tile([0.01, 0.01, 0.02], (KINDS, 1)), rel=1e-4)
 
 
-def test_pictures_are_square() -> None:
+def test_images_are_square() -> None:
     assert area_averaged(torch.zeros(1, 3, 360, 360)).shape == (1, 3, SIDE, SIDE)
-    with pytest.raises(MemobenchError, match="found pictures of 320 x 256 pixels"):
+    with pytest.raises(MemobenchError, match="found images of 320 x 256 pixels"):
         area_averaged(torch.zeros(1, 3, 320, SIDE))

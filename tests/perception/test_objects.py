@@ -202,7 +202,7 @@ def test_two_cameras_detect_one_object(
     assert len(objects_of(slots)) == objects
 
 
-def test_package_detector_reads_pictures_and_warns_once_of_its_former_scenes(caplog: pytest.LogCaptureFixture) -> None:
+def test_package_detector_reads_images_and_warns_once_of_its_former_scenes(caplog: pytest.LogCaptureFixture) -> None:
     """Its accuracy on these scenes is not tested: it was trained on others."""
     warn_of_former_scenes.cache_clear()
     detector = load_detector(PACKAGE)
@@ -211,9 +211,9 @@ def test_package_detector_reads_pictures_and_warns_once_of_its_former_scenes(cap
     assert "python -m research.detector train" in warned
     assert detector.kinds == kinds()
     sim, localizer = simulation(BOWLS), ObjectLocalizer(detector)
-    pictures = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
-    found = localizer(pictures, torch.from_numpy(sim.proprio())[None])
-    assert torch.equal(found, localizer(pictures, torch.from_numpy(sim.proprio())[None]))
+    images = {name: torch.from_numpy(sim.render(name)).permute(2, 0, 1)[None] / 255 for name in MJCF_CAMERAS}
+    found = localizer(images, torch.from_numpy(sim.proprio())[None])
+    assert torch.equal(found, localizer(images, torch.from_numpy(sim.proprio())[None]))
     assert (found.shape, found.dtype) == ((1, SIZE), torch.float32)
     rows = objects_of(found)
     assert len(rows) > 0

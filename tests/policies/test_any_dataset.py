@@ -35,7 +35,7 @@ def numbers(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.normal(size=count).astype(np.float32)
 
 
-def pictures(rng: np.random.Generator, cameras: Mapping[str, tuple[int, int]]) -> dict[str, np.ndarray]:
+def images(rng: np.random.Generator, cameras: Mapping[str, tuple[int, int]]) -> dict[str, np.ndarray]:
     return {name: rng.integers(0, 255, (*size, 3), np.uint8) for name, size in cameras.items()}
 
 
@@ -43,7 +43,7 @@ def write(
     root: Path, cameras: Mapping[str, tuple[int, int]], state: int, action: int, fps: int = 30, **texts: str
 ) -> Path:
     """Write an episode of a robot; ``cameras``: name -> height and width."""
-    picture = {"dtype": "image", "names": ["height", "width", "channels"]}
+    image = {"dtype": "image", "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
         "somebody/robot",
         fps=fps,
@@ -52,14 +52,14 @@ def write(
         features={
             STATE: {"dtype": "float32", "shape": (state,), "names": None},
             ACTION: {"dtype": "float32", "shape": (action,), "names": None},
-            **{name: {**picture, "shape": (*size, 3)} for name, size in cameras.items()},
+            **{name: {**image, "shape": (*size, 3)} for name, size in cameras.items()},
             **{name: {"dtype": "string", "shape": (1,), "names": None} for name in texts},
         },
     )
     rng = np.random.default_rng(0)
     for _ in range(8):
         frame = {STATE: numbers(rng, state), ACTION: numbers(rng, action), "task": TASK}
-        dataset.add_frame(frame | pictures(rng, cameras) | texts)
+        dataset.add_frame(frame | images(rng, cameras) | texts)
     dataset.save_episode()
     dataset.finalize()
     return root
@@ -100,7 +100,7 @@ def test_datasets_of_other_robots(
     rng, cpu = np.random.default_rng(1), torch.device("cpu")
     policy.reset()
     for _ in range(5):
-        seen = {STATE: numbers(rng, state), **pictures(rng, cameras)}
+        seen = {STATE: numbers(rng, state), **images(rng, cameras)}
         found = predict_action(seen, policy, cpu, before, after, False, TASK, "arm")
         assert found.shape == (1, action)
         assert found.isfinite().all()

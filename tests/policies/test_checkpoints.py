@@ -127,7 +127,7 @@ def refused(checkpoint: Path, capsys: pytest.CaptureFixture[str], *more: str) ->
     [
         ({"cameras": ("front", "wrist")}, '"observation.images.image": "observation.images.front"'),
         ({"cameras": ("wrist_image", "front")}, '{"observation.images.image": "observation.images.front"}'),
-        ({"cameras": (*CAMERAS, "empty_camera_0")}, "no picture for observation.images.empty_camera_0"),
+        ({"cameras": (*CAMERAS, "empty_camera_0")}, "no image for observation.images.empty_camera_0"),
         ({"state": 7}, f"{STATE} of 7 numbers"),
         ({"action": 6}, f"{ACTION} of 6 numbers"),
         ({"side": 128}, "observation.images.image of 128 x 128 pixels"),
@@ -149,7 +149,7 @@ def test_inputs_that_differ_are_refused(inputs: dict[str, Any], named: str, tmp_
         (("camera1",), 2, 1),
     ],
 )
-def test_empty_cameras_fill_the_last_pictures(cameras: tuple[str, ...], empty: int, read: int) -> None:
+def test_empty_cameras_fill_the_last_images(cameras: tuple[str, ...], empty: int, read: int) -> None:
     policy = config("smolvla", cameras, empty_cameras=empty)
     assert cameras_read(policy, {}) == [IMAGES + name for name in cameras[:read]]
 

@@ -1,4 +1,4 @@
-"""A checkpoint runs on pictures of the convention that it was trained on, or is refused with the command for it."""
+"""A checkpoint runs on images of the convention that it was trained on, or is refused with the command for it."""
 
 from __future__ import annotations
 
@@ -101,10 +101,10 @@ def test_the_dataset_on_this_machine_decides(tmp_path: Path, convention: str) ->
     (tmp_path / "libero_scenes" / "meta" / "info.json").write_text(json.dumps(info))
     path = saved(tmp_path, ("image",), repo_id="local/libero_scenes", root=str(tmp_path / "libero_scenes"))
     assert outcome(path, None) == outcome(path, convention) == convention
-    assert "expects pictures" in outcome(path, {"upright": "libero", "libero": "upright"}[convention])
+    assert "expects images" in outcome(path, {"upright": "libero", "libero": "upright"}[convention])
 
 
-def test_no_pictures_no_convention(tmp_path: Path) -> None:
+def test_no_images_no_convention(tmp_path: Path) -> None:
     objects = {"observation.environment_state": {"type": "ENV", "shape": [208]}}
     path = make_checkpoint(tmp_path / "act", "act", input_features=objects)
     assert outcome(path, None) == "None", "that of the environment"
@@ -119,13 +119,13 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
     for names in pairs:
         renamed = {f"observation.images.{old}": f"observation.images.{new}" for old, new in names.items()}
         for words in ([], ["convention=libero"]):
-            with pytest.raises(MemobenchError, match="found upright in rename_map, which does not mirror pictures"):
+            with pytest.raises(MemobenchError, match="found upright in rename_map, which does not mirror images"):
                 plan_line([*line, f"rename_map={json.dumps(renamed)}", *words])
     with pytest.raises(MemobenchError, match="did you mean 'libero'"):
         plan_line([*line, "convention=liberu"])
     ours = saved(tmp_path / "ours", OURS)
     back = json.dumps({"observation.images.image2": "observation.images.wrist_image"})
-    with pytest.raises(MemobenchError, match="expects pictures of convention=upright"):
+    with pytest.raises(MemobenchError, match="expects images of convention=upright"):
         plan_line([*line[:3], f"policy={ours}", "convention=libero", f"rename_map={back}"])
     plan = plan_line([*line[:3], "policy=memobench_random", "convention=libero"])
     assert plan.environment.features_map["pixels/image2"] == "observation.images.image2"
@@ -143,7 +143,7 @@ def test_the_names_of_a_training_are_those_of_its_evaluation(tmp_path: Path, cap
     mine = replace(asked, rename_map={"observation.images.image": "mine"})
     assert with_names(mine, MemobenchEnvConfig(convention="libero")) == mine
     assert outcome(path, None) == "libero"
-    assert f"pictures have convention=libero, as in the training of {path}" in caplog.text
+    assert f"images have convention=libero, as in the training of {path}" in caplog.text
 
 
 @contextmanager
@@ -178,7 +178,7 @@ def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
     mapping = f"camera_name_mapping={json.dumps(names)}"
     assert plan_line([*line[:3], f"policy={unclear}", mapping]).environment.convention == "libero"
     ours = saved(tmp_path / "ours", OURS)
-    with pytest.raises(MemobenchError, match=r"expects pictures of convention=upright.*, and found libero"):
+    with pytest.raises(MemobenchError, match=r"expects images of convention=upright.*, and found libero"):
         plan_line([*line[:3], f"policy={ours}", mapping])
     for bad in ("camera1", "[camera1]", "{"):
         with pytest.raises(MemobenchError, match="expected a mapping"):
@@ -202,9 +202,9 @@ def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.Mon
     with refused("and found upright"):
         envs(theirs, f"--config_path={settings}")
     names = {"observation.images.wrist_image": "observation.images.image2"}
-    with refused("which does not mirror pictures"):
+    with refused("which does not mirror images"):
         envs(theirs, f"--rename_map={json.dumps(names)}")
-    with refused("may expect upright pictures or mirrored ones"):
+    with refused("may expect upright images or mirrored ones"):
         envs(unclear)
     assert _executed(envs(theirs, "--env.convention=libero", convention="libero")) == 100
     assert envs(unclear, "--env.convention=upright")
@@ -237,7 +237,7 @@ def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
 
 
 def _shown(suites: Any) -> set[str]:
-    """Return the names of the pictures that environments show."""
+    """Return the names of the images that environments show."""
     ((env,),) = (suite.values() for suite in suites.values())
     return {*env.single_observation_space["pixels"]}
 

@@ -41,9 +41,9 @@ def test_training_and_rollout(tmp_path: Path) -> None:
     train_and_roll_out(data, tmp_path, "policy=pi05", *(f"policy.{name}={value}" for name, value in words.items()))
 
 
-def test_visual_memory_needs_every_picture() -> None:
+def test_visual_memory_needs_every_image() -> None:
     check(pi05(use_visual_memory=True), execution, range(STEPS))
 
 
-def test_memory_of_states_needs_no_pictures() -> None:
+def test_memory_of_states_needs_no_images() -> None:
     check(pi05(use_proprioceptive_memory=True), execution, range(0, STEPS, PLAN))

@@ -39,8 +39,8 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def save(folder: Path, kind: str, cameras: dict[str, int], state: int, **settings: Any) -> Path:
     """Write a checkpoint of random weights; ``cameras``: name -> side, pixels."""
-    pictures = {f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, side, side)) for name, side in cameras.items()}
-    inputs = {**pictures, "observation.state": PolicyFeature(FeatureType.STATE, (state,))}
+    images = {f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, side, side)) for name, side in cameras.items()}
+    inputs = {**images, "observation.state": PolicyFeature(FeatureType.STATE, (state,))}
     config = make_policy_config(
         kind,
         input_features=inputs,
@@ -66,7 +66,7 @@ def train(policy: Path, dataset: Path, run: Path, *words: str) -> Path:
 
 
 def evaluated(policy: Path, out: Path) -> tuple[str, dict[str, str]]:
-    """Run one short episode of a memory task; return the convention and the names of its pictures."""
+    """Run one short episode of a memory task; return the convention and the names of its images."""
     words = (f"tasks={TASK}", "episodes=1", "horizon=3", "eval.use_async_envs=false", f"output_dir={out}")
     assert main(["eval", "env=memobench", f"policy={policy}", *words]) == 0
     card = read_evaluation(out, whole=True)

@@ -43,7 +43,7 @@ Row = tuple[int, int]
 
 
 def observation(rows: Sequence[Row], time: int, **more: Any) -> dict[str, Any]:
-    """Return an observation as LeRobot's loop does, with new pictures at each step."""
+    """Return an observation as LeRobot's loop does, with new images at each step."""
     generator = torch.Generator().manual_seed(time)
     return {
         **{key: torch.rand(len(rows), 3, 96, 96, generator=generator) for key in CAMERAS},
@@ -64,7 +64,7 @@ def acted(
     """Return a rollout's actions (time, rows, 7), and the times of needed observations.
 
     Args:
-        blind: replace pictures that are not needed by NaN. The first frames of an episode and of its execution are
+        blind: replace images that are not needed by NaN. The first frames of an episode and of its execution are
             always shown.
     """
     torch.manual_seed(0)

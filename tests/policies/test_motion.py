@@ -31,9 +31,9 @@ from lerobot_memobench.policies.memobench_mem.memory.motion import (
     PER_STEP,
     REACH,
     UNCHANGED,
+    ImageMotion,
     Motion,
     ObjectMotion,
-    PictureMotion,
     match_blocks,
 )
 from lerobot_memobench.policies.memobench_mem.objects import frame_row
@@ -41,7 +41,7 @@ from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import Gat
 from lerobot_memobench.sim.object_layout import SLOTS, WIDTH
 from tests.support.small_policy import batch_of, made_for_training
 
-# -- pictures ---------------------------------------------------------------------------------------------------------
+# -- images ---------------------------------------------------------------------------------------------------------
 
 
 def matched_slowly(before: np.ndarray, now: np.ndarray) -> np.ndarray:
@@ -66,8 +66,8 @@ def test_blocks_equal_a_slow_search() -> None:
     chance = np.random.default_rng(0)
     before = np.kron(chance.integers(0, 256, (3, 22, 22)), np.ones((3, 3)))[:, :THUMBNAIL, :THUMBNAIL]
     ways = ((1, -2), (0, 4), (5, 0))
-    now = np.stack([np.roll(picture, by, (0, 1)) for picture, by in zip(before, ways, strict=True)])
-    now[:, :30] = before[:, :30]  # half of the picture does not move
+    now = np.stack([np.roll(image, by, (0, 1)) for image, by in zip(before, ways, strict=True)])
+    now[:, :30] = before[:, :30]  # half of the image does not move
     now[:, :30] += chance.integers(0, 3, now[:, :30].shape)
     found = match_blocks(torch.tensor(before), torch.tensor(now))
     np.testing.assert_array_equal(found, [matched_slowly(*pair) for pair in zip(before, now, strict=True)])
@@ -102,7 +102,7 @@ def moved(field: Tensor) -> Tensor:
 
 def test_frames_of_a_batch_may_be_strided() -> None:
     """Those of a training are slices of longer histories."""
-    field, frames = PictureMotion(16, 8), torch.randint(0, 255, (3, 4, THUMBNAIL**2), dtype=torch.uint8)
+    field, frames = ImageMotion(16, 8), torch.randint(0, 255, (3, 4, THUMBNAIL**2), dtype=torch.uint8)
     strided = frames[:, :2].transpose(0, 1)
     assert torch.equal(field.between(strided, strided), field.between(strided.contiguous(), strided.contiguous()))
     assert field.following(frames)[0].shape == (3, 3, BLOCKS**2, 2)
@@ -229,7 +229,7 @@ def test_hindsight_has_no_effect_before_training(trained: tuple[Any, dict[str, A
     assert one != pytest.approx(other)
 
 
-def test_motion_of_pictures_is_aligned(dataset_root: Path) -> None:
+def test_motion_of_images_is_aligned(dataset_root: Path) -> None:
     """Gradients of its convolutions are not contiguous."""
     policy, before, _, dataset = made_for_training(dataset_root, size="small", memory="motion", align="contrastive")
     _, logged = policy.train()(before(batch_of(dataset, [5, 9, 12, 15])))

@@ -252,10 +252,10 @@ def test_shared_frames_equal_copies() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_prefix_equals_lerobots(dtype: torch.dtype) -> None:
     backbone = make_backbone(MemobenchMemConfig(device="cpu"))
-    pictures = (torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
+    images = (torch.rand(2, 3, 96, 96, generator=torch.Generator().manual_seed(0)) * 2 - 1).to(dtype)
     with torch.no_grad():
-        expected = PaliGemmaWithExpertModel.embed_image(backbone, pictures)
-        assert torch.equal(backbone.perception.prefix(pictures), expected)
+        expected = PaliGemmaWithExpertModel.embed_image(backbone, images)
+        assert torch.equal(backbone.perception.prefix(images), expected)
 
 
 def test_cached_positions_of_a_rollout_have_gradients() -> None:

@@ -28,13 +28,13 @@ from tests.support.tiny_smolvlm import tiny_smolvlm
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 STATE, OBJECTS = "observation.state", "observation.environment_state"
-PICTURES = {"observation.images.image", "observation.images.wrist_image"}
-INPUTS = {*PICTURES, STATE}
+IMAGES = {"observation.images.image", "observation.images.wrist_image"}
+INPUTS = {*IMAGES, STATE}
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Short demonstrations with pictures and objects."""
+    """Short demonstrations with images and objects."""
     return write_streams(tmp_path_factory.mktemp("others") / "demonstrations", frames=9, task=TASK)
 
 
@@ -81,7 +81,7 @@ DEFAULT = (("diffusion", "pixels"), ("act", "both"))
 
 
 @pytest.mark.parametrize(
-    ("policy", "pictures", "obs_type", "seen"),
+    ("policy", "images", "obs_type", "seen"),
     [
         pytest.param(
             words, *SHOWN[case], marks=() if (name, case) in DEFAULT else pytest.mark.slow, id=f"{name} {case}"
@@ -91,10 +91,10 @@ DEFAULT = (("diffusion", "pixels"), ("act", "both"))
     ],
 )
 def test_evaluation_has_the_inputs_of_training(
-    policy: tuple[str, ...], pictures: bool, obs_type: str | None, seen: str, tmp_path: Path
+    policy: tuple[str, ...], images: bool, obs_type: str | None, seen: str, tmp_path: Path
 ) -> None:
-    of = {"pixels_agent_pos": PICTURES, "environment_state_agent_pos": {OBJECTS}, "both": PICTURES | {OBJECTS}}
-    dataset = write_streams(tmp_path / "demonstrations", pictures, frames=9, task=TASK)
+    of = {"pixels_agent_pos": IMAGES, "environment_state_agent_pos": {OBJECTS}, "both": IMAGES | {OBJECTS}}
+    dataset = write_streams(tmp_path / "demonstrations", images, frames=9, task=TASK)
     words = policy if obs_type is None else (*policy, f"obs_type={obs_type}")
     protocol = train_and_roll_out(dataset, tmp_path, *words, inputs={STATE} | of[seen])
     assert protocol["obs_type"] == seen

@@ -1,7 +1,7 @@
 """Perceptions: training, rollouts and checkpoints agree for each of them; slots of objects; samples of tasks.
 
 The five perceptions are pi0.5's image tower, the visual encoder, privileged object state, the same with detection
-noise, and detections in pictures.
+noise, and detections in images.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ from tests.support.small_policy import batch_of, made_for_training
 from tests.support.synthetic_dataset import CAMERAS, make_dataset
 
 FILMED = (12, 23, 9)
-"""Lengths of the episodes with pictures; the second has a prompt of 8 frames, as in the dataset of objects."""
+"""Lengths of the episodes with images; the second has a prompt of 8 frames, as in the dataset of objects."""
 PROMPT_KEYS = ("observation.language.tokens", "observation.language.attention_mask")
 
 
@@ -114,11 +114,11 @@ class Case:
             "observation.step": torch.tensor([step]),
             "observation.phase": row["observation.phase"].reshape(1).float(),
         }
-        pictures = {} if OBS_ENV_STATE in row else self.pictures(index)
-        return {**pictures, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
+        images = {} if OBS_ENV_STATE in row else self.images(index)
+        return {**images, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
 
-    def pictures(self, index: int) -> dict[str, Tensor]:
-        """Return the pictures of all cameras at a frame, (1, 3, H, W)."""
+    def numbered_image(self, index: int) -> dict[str, Tensor]:
+        """Return the images of all cameras at a frame, (1, 3, H, W)."""
         episode = int(np.searchsorted(self.starts, index, "right")) - 1
         numbers = [index - self.starts[episode]]
         return {camera: reader_of(self.root, camera)(episode, numbers) for camera in CAMERAS}
@@ -144,12 +144,12 @@ def detector(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def cases(root: Path, detector: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     folder = tmp_path_factory.mktemp("perceptions")
-    pictures = make_dataset(folder / "pictures", lengths=FILMED)
+    images = make_dataset(folder / "images", lengths=FILMED)
     shared = {"n_action_steps": 3, "memory_stride": 2}
     return {
         name: Case(
             one,
-            root if one.needs == OBS_ENV_STATE else pictures,
+            root if one.needs == OBS_ENV_STATE else images,
             shared | {key: str(detector) if value == "FILE" else value for key, value in one.fields.items()},
         )
         for name, one in PERCEPTIONS.items()
@@ -193,7 +193,7 @@ def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
     assert difference(*prefixes) <= 2 * case.of.rounding
 
 
-def test_memory_is_trained_and_pictures_encoders_are_not(case: Case) -> None:
+def test_memory_is_trained_and_images_encoders_are_not(case: Case) -> None:
     policy, before, _, dataset = case.shared
     policy.train().forward(
         before(batch_of(dataset, [10, case.starts[1] + 10, case.starts[1] + 20, case.starts[2] + 5]))
@@ -247,13 +247,13 @@ def test_samples_hold_features_and_decode_no_video(case: Case, monkeypatch: pyte
     batch = before(batch_of(dataset, [first, first + 5]))
     assert len(batch[FRAMES]) < (batch[PLACES] >= 0).sum(), "samples of an episode share frames"
     if "detector" in case.fields:
-        truth = policy.perception.detect(case.pictures(first), batch[OBS_RAW_STATE][:1])
+        truth = policy.perception.detect(case.images(first), batch[OBS_RAW_STATE][:1])
         assert truth.any()
         assert torch.allclose(batch[DETECTED][:1], truth, rtol=2**-15, atol=1e-7)
     else:
         assert all(batch[encoded_key(camera)].shape == (2, GRID**2, WIDTH) for camera in CAMERAS)
         assert batch[FRAMES].shape[1:] == (POOLED**2, WIDTH)
-    losses = []  # pictures in a batch of LeRobot's have no effect
+    losses = []  # images in a batch of LeRobot's have no effect
     for one in (decoded, {**decoded, **{name: 1 - decoded[name] for name in CAMERAS}}, batch_of(dataset, [first])):
         torch.manual_seed(0)
         losses.append(policy.train().forward(before(one))[0].item())
@@ -264,7 +264,7 @@ def test_samples_hold_features_and_decode_no_video(case: Case, monkeypatch: pyte
 
 
 def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detector: Path, tmp_path: Path) -> None:
-    """A policy that never saw pictures acts by a detector as by its detections; the state has no effect then."""
+    """A policy that never saw images acts by a detector as by its detections; the state has no effect then."""
     policy, before, after, _ = cases["privileged objects"].shared
     for part in (policy, before, after):
         part.save_pretrained(tmp_path)
@@ -273,7 +273,7 @@ def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detecto
         config: Any = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=overrides)
         acting = MemobenchMemPolicy.from_pretrained(tmp_path, config=config)
         found.append((acting, make_pre_post_processors(acting.config, str(tmp_path))[0]))
-    (given, of_objects), (seeing, of_pictures) = found
+    (given, of_objects), (seeing, of_images) = found
     assert set(seeing.config.image_features) == {*VIEWS}
     assert obs_type_of(seeing.config) == PIXELS != obs_type_of(given.config)
     case = cases["detections"]
@@ -283,7 +283,7 @@ def test_policies_of_objects_act_from_detections(cases: dict[str, Case], detecto
         slots = seeing.perception.detect(batch, batch[OBS_STATE])
         objects = {key: value for key, value in batch.items() if key not in VIEWS} | {OBS_ENV_STATE: slots}
         noise = {OBS_ENV_STATE: torch.ones(1, SIZE)}
-        assert torch.equal(given.select_action(of_objects(objects)), seeing.select_action(of_pictures(batch | noise)))
+        assert torch.equal(given.select_action(of_objects(objects)), seeing.select_action(of_images(batch | noise)))
 
 
 def test_unusable_encoder_files_are_named(cases: dict[str, Case], tmp_path: Path) -> None:
@@ -293,14 +293,14 @@ def test_unusable_encoder_files_are_named(cases: dict[str, Case], tmp_path: Path
         made_for_training(cases["visual encoder"].root, size="small", visual_encoder=str(file))
 
 
-def test_detectors_need_pictures_and_a_file(root: Path, detector: Path) -> None:
-    for file, named in ((detector, "pictures"), ("absent", "absent")):
+def test_detectors_need_images_and_a_file(root: Path, detector: Path) -> None:
+    for file, named in ((detector, "images"), ("absent", "absent")):
         with pytest.raises(MemobenchError, match=named):
             made_for_training(root, **OBJECTS, detector=str(file))
 
 
-def test_objects_next_to_pictures_decode_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = make_object_dataset(tmp_path / "filmed", pictures=True)
+def test_objects_next_to_images_decode_no_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = make_object_dataset(tmp_path / "filmed", images=True)
     monkeypatch.setattr("lerobot.datasets.dataset_reader.decode_video_frames", None)
     policy, before, _, dataset = made_for_training(folder, **OBJECTS)
     assert set(policy.config.input_features) == {OBS_STATE, OBS_ENV_STATE}

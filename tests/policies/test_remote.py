@@ -28,19 +28,29 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import remote_connection as wire
 from lerobot_memobench.policies.remote import MOST_ACTIONS, RemoteConfig, RemotePolicy, fit
 from tests.support.policy_server import PolicyServer, robomme
-from tests.support.remote_case import IMPATIENT, PATIENT, TASK, batch, counting, frames_of, free_port, make, pictures
+from tests.support.remote_case import (
+    IMPATIENT,
+    PATIENT,
+    TASK,
+    batch,
+    counting,
+    frames_of,
+    free_port,
+    make,
+    numbered_image,
+)
 from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
 
 
 def steps_of(questions: list[dict[str, Any]]) -> list[int]:
-    """Return the steps whose pictures were sent."""
+    """Return the steps whose images were sent."""
     return [int(question["observation/image"][0, 0, 0]) for question in questions]
 
 
 # --- openpi ---
 
 
-def test_openpi_gets_liberos_pictures_under_its_names_whatever_the_environment_calls_them() -> None:
+def test_openpi_gets_liberos_images_under_its_names_whatever_the_environment_calls_them() -> None:
     """And parts of ``robot_state`` where ``keys`` asks for them."""
     keys = ",".join(
         [*(f"{theirs}={ours}" for theirs, ours in RemoteConfig().sent().items()), "joints=robot_state.joints.pos"]
@@ -59,8 +69,8 @@ def test_openpi_gets_liberos_pictures_under_its_names_whatever_the_environment_c
         joints = question.pop("joints", None)
         assert set(question) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
         (episode,) = env.get_attr("episode")
-        for name, picture in episode.images().items():
-            assert np.array_equal(question[f"observation/{name}"], picture[:, ::-1])
+        for name, image in episode.images().items():
+            assert np.array_equal(question[f"observation/{name}"], image[:, ::-1])
     assert joints is not None
     assert np.array_equal(joints, np.float32(episode.sim.robot_state()["joints"]["pos"]))
 
@@ -82,17 +92,17 @@ def test_openpi_questions_hold_the_inputs_of_its_libero_servers() -> None:
     assert first["observation/state"].dtype == np.float32
     assert np.array_equal(first["observation/state"], np.arange(8) + 1)
     # As rendered: every pixel survives LeRobot's division by 255.
-    assert np.array_equal(second["observation/image"], pictures(7))
-    assert np.array_equal(second["observation/wrist_image"], pictures(7)[:, ::-1])
+    assert np.array_equal(second["observation/image"], numbered_image(7))
+    assert np.array_equal(second["observation/wrist_image"], numbered_image(7)[:, ::-1])
     assert (third["t"], third["language"]) == ([4], "do it")
-    assert np.array_equal(third["video.front"], pictures(4))
+    assert np.array_equal(third["video.front"], numbered_image(4))
 
 
 def test_a_server_states_the_convention_of_its_policy() -> None:
     libero = batch(0)
     libero[f"{OBS_IMAGES}.image2"] = libero.pop(f"{OBS_IMAGES}.wrist_image")
     for stated, runs, refused in (("libero", libero, batch(0)), ("upright", batch(0), libero)):
-        asks_for = f"expects pictures of convention={stated}, and found .*; give convention={stated}"
+        asks_for = f"expects images of convention={stated}, and found .*; give convention={stated}"
         frames: list[Any] = [("hello", {**hello()[0][1], "observation_params": {"trained_convention": stated}})]
         openpi, scripted = PolicyServer(metadata={"trained_convention": stated}), ScriptedServer(hello=frames)
         with openpi, scripted:
@@ -180,11 +190,11 @@ def test_vla_eval_episode_with_a_prompt() -> None:
     assert server.ended == 2
     (_, first), (_, second), (_, third) = [(step, observed) for _, step, observed in server.heard]
     assert list(first["images"]) == ["agentview", "wrist"]  # servers use their order
-    assert np.array_equal(first["images"]["agentview"], pictures(0))
-    assert np.array_equal(first["images"]["wrist"], pictures(0)[:, ::-1])
+    assert np.array_equal(first["images"]["agentview"], numbered_image(0))
+    assert np.array_equal(first["images"]["wrist"], numbered_image(0)[:, ::-1])
     assert (first["states"].dtype, first["states"].tolist()) == (np.float32, list(range(1, 9)))
     assert (first["task_description"], first["episode_restart"]) == ("do it", True)
-    assert all(np.array_equal(found, pictures(step)) for step, found in enumerate(first["video_history"]))
+    assert all(np.array_equal(found, numbered_image(step)) for step, found in enumerate(first["video_history"]))
     assert [len(first[name]) for name in ("video_history", "wrist_video_history", "state_history")] == [3, 3, 3]
     # The server plans two actions at a time and needs no observation for the second.
     assert [step for _, step, _ in server.heard] == [0, 2, 0]

@@ -99,7 +99,7 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["task=published,strict", "policy=memobench_random"], "'published' is a suite, no task; set suite=published"),
         (["suite=libero_object", "tasks=pick_up_the_mil_and_place_it_in_the_basket"], "place_it_in_the_basket'?"),
         (["suite=libero_long"], "LIBERO-Long is 'libero_10'"),
-        (["suite=libero_object", "policy=memobench_strict"], "suite=libero_object has pictures alone"),
+        (["suite=libero_object", "policy=memobench_strict"], "suite=libero_object has images alone"),
         (["task=libero_object", "task_ids=0"], "expected ids of LIBERO's tasks in a list"),
         (["task=libero_object", "suite=libero_goal"], "both given"),
         (["task=libero_object", "task_ids=[0]", "tasks=1"], "both given"),
@@ -131,19 +131,19 @@ def test_refusals_are_one_sentence(
     assert not fake_loop.ran
 
 
-def test_checkpoints_run_on_the_pictures_of_their_training(
+def test_checkpoints_run_on_the_images_of_their_training(
     fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    picture = {"type": "VISUAL", "shape": [3, 256, 256]}
+    image = {"type": "VISUAL", "shape": [3, 256, 256]}
     state, action = {"type": "STATE", "shape": [8]}, {"type": "ACTION", "shape": [7]}
     for name, wrist in (("upright", "wrist_image"), ("mirrored", "image2")):
-        pictures = {f"observation.images.{camera}": picture for camera in ("image", wrist)}
-        features = {"input_features": {**pictures, "observation.state": state}, "output_features": {"action": action}}
+        images = {f"observation.images.{camera}": image for camera in ("image", wrist)}
+        features = {"input_features": {**images, "observation.state": state}, "output_features": {"action": action}}
         make_checkpoint(Path(name), "act", **features)
     for name, convention in (("mirrored", "libero"), ("upright", "upright")):
         assert plan_line([*LINE[:1], *LINE[2:], f"policy=./{name}"]).environment.convention == convention
     found = error(capsys, "suite=libero_object", "convention=libero", "policy=./upright")
-    assert "expects pictures of convention=upright" in found
+    assert "expects images of convention=upright" in found
     assert "and found libero" in found
 
 

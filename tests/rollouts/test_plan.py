@@ -179,14 +179,14 @@ def test_without_the_assets_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 FEATURES = {
-    "pictures": {"observation.images.wrist_image": {"type": "VISUAL", "shape": [3, 256, 256]}},
+    "images": {"observation.images.wrist_image": {"type": "VISUAL", "shape": [3, 256, 256]}},
     "objects": {"observation.environment_state": {"type": "ENV", "shape": [208]}},
 }
 
 
 @pytest.mark.parametrize(
     ("seen", "shown"),
-    [(("pictures",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "pictures"), "both")],
+    [(("images",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "images"), "both")],
 )
 def test_a_checkpoint_gets_the_inputs_it_was_trained_on(seen: tuple[str, ...], shown: str) -> None:
     features = {key: value for name in seen for key, value in FEATURES[name].items()}

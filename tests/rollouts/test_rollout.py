@@ -1,4 +1,4 @@
-"""The rollout loop: LeRobot's episodes, action for action, with fewer pictures; and the seeds of batches."""
+"""The rollout loop: LeRobot's episodes, action for action, with fewer images; and the seeds of batches."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def short_prompts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The step of each observation whose pictures are drawn."""
+    """The step of each observation whose images are drawn."""
     steps: list[int] = []
     draw = episode.Episode.images
 
@@ -236,13 +236,13 @@ def test_a_rollout_on_objects_equals_lerobots(
     assert (len(found) < everything) == spares
 
 
-def test_a_memory_of_pictures_refuses_objects_alone(tmp_path: Path) -> None:
+def test_a_memory_of_images_refuses_objects_alone(tmp_path: Path) -> None:
     with pytest.raises(MemobenchError, match=r"env\.obs_type=pixels_agent_pos"):
         rolled(False, 1, tmp_path, "memobench_mem", obs_type=OBJECTS, **MEMORY)
 
 
 @pytest.mark.parametrize("use_async", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_unneeded_pictures_are_not_drawn(use_async: bool, tmp_path: Path) -> None:
+def test_unneeded_images_are_not_drawn(use_async: bool, tmp_path: Path) -> None:
     """A call of the vector environment, in this process or in workers, lasts until the next reset."""
     config = MemobenchEnvConfig(tasks=HIGHLIGHT, demonstration_prompt=False, log_dir=str(tmp_path))
     ((env,),) = (suite.values() for suite in config.create_envs(2, use_async).values())
@@ -262,7 +262,7 @@ def test_unneeded_pictures_are_not_drawn(use_async: bool, tmp_path: Path) -> Non
 
 
 def test_recorded_episodes_are_drawn_whole(drawn: list[int], tmp_path: Path) -> None:
-    """One of two episodes is recorded; of the other the needed pictures are drawn."""
+    """One of two episodes is recorded; of the other the needed images are drawn."""
     from lerobot_memobench.envs.video import LAST_FRAMES
     from lerobot_memobench.evaluation.html import frame_count
 
@@ -340,7 +340,7 @@ def test_draws_depend_on_the_batch_alone() -> None:
 
 
 def test_an_xvla_gets_the_environments_processors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """LeRobot's function would give it the processors of LIBERO: a turned picture, no clock, six numbers of seven."""
+    """LeRobot's function would give it the processors of LIBERO: a turned image, no clock, six numbers of seven."""
     loaded = SimpleNamespace(config=SimpleNamespace(device="cpu"))
     monkeypatch.setattr(evaluation, "make_policy", lambda **_: SimpleNamespace(eval=lambda: loaded))
     monkeypatch.setattr(evaluation, "make_pre_post_processors", lambda **_: (None, None))

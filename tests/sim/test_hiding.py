@@ -81,7 +81,7 @@ def test_a_wrist_camera_that_looks_up_lists_no_absent_object(joints: tuple[float
     rays = slots.things[next(k for k, t in enumerate(slots.things) if t.body == sim.model.body(hidden).id)]
     camera = sim.data.cam("robot0_eye_in_hand")
     direction = camera.xmat.reshape(3, 3).T @ (slots.position(rays) - camera.xpos)
-    assert np.hypot(*direction[:2]) < -direction[2]  # the camera's picture contains the parking place
+    assert np.hypot(*direction[:2]) < -direction[2]  # the camera's image contains the parking place
 
 
 def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_restored() -> None:

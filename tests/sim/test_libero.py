@@ -50,8 +50,8 @@ STEPS = 5
 """Largest number of control steps in which an atom or success may differ; `Then` requires this number."""
 AT_REST, OBSERVED = 3e-4, 1e-6
 """Tolerance of the observed state after the reset, when the arm still moves slowly, and at equal times."""
-PICTURE, MIRRORED = 4.0, 20.0
-"""Largest mean difference of a picture, and least one of a mirrored picture, of 255."""
+IMAGE, MIRRORED = 4.0, 20.0
+"""Largest mean difference of an image, and least one of a mirrored image, of 255."""
 STOVE = "turn_on_the_stove_and_turn_it_off"
 ONE_OF_EACH_ARENA = {
     "table": "open_the_middle_drawer_of_the_cabinet",
@@ -241,13 +241,13 @@ def test_a_scripted_execution_succeeds_at_the_same_step(suite: str) -> None:
 
 @pytest.mark.parametrize("suite", ["libero_spatial", pytest.param("libero_object", marks=pytest.mark.slow)])
 def test_observations_are_those_of_lerobots_libero(suite: str) -> None:
-    """robosuite observes fingers 2 ms and the hand 4 ms before the end of a control step; pictures bottom up."""
+    """robosuite observes fingers 2 ms and the hand 4 ms before the end of a control step; images bottom up."""
     seen = part_of("observations", f"{suite}:")
     sim = start(libero_tasks(suite)[{"libero_spatial": 0, "libero_object": 3}[suite]])
     assert np.abs(sim.proprio() - seen["0.processed.observation.state"][0]).max() <= AT_REST
     for camera, image in (("agentview", "image"), ("wrist", "image2")):
         ours, theirs = sim.render(camera)[::-1].astype(int), seen[f"0.raw.pixels.{image}"]
-        assert np.abs(ours[::4, ::4] - theirs).mean() <= PICTURE
+        assert np.abs(ours[::4, ::4] - theirs).mean() <= IMAGE
         assert np.abs(ours[:, ::-1][::4, ::4] - theirs).mean() >= MIRRORED
     for step in range(2):
         action = seen[f"{step}.action"]

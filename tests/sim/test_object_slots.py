@@ -75,12 +75,12 @@ def test_every_scene_fits_with_correct_poses(name: str) -> None:
 
 def seen_pixels(sim: Simulation, name: str) -> int:
     """Return the pixels of both cameras that change without the object; there are no shadows."""
-    pictures, state = [], sim.state()
+    images, state = [], sim.state()
     for _ in range(2):
-        pictures.append(np.stack([sim.render(camera) for camera in MJCF_CAMERAS]))
+        images.append(np.stack([sim.render(camera) for camera in MJCF_CAMERAS]))
         put(sim, name, np.array([0.0, 0.0, -5.0]))
     sim.set_state(state)
-    return int((pictures[0] != pictures[1]).any(axis=-1).sum())
+    return int((images[0] != images[1]).any(axis=-1).sum())
 
 
 @pytest.mark.parametrize("name", [pytest.param(NINE, marks=pytest.mark.slow), DRAWERS])

@@ -152,8 +152,8 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_guides_example(place: Path) -> None:
     exec(scripts()[1], {})
-    picture = np.asarray(Image.open(place / "sponge.png")).astype(int)
-    green = (picture[..., 1] > picture[..., 0] + 20) & (picture[..., 1] > picture[..., 2] + 20)
+    image = np.asarray(Image.open(place / "sponge.png")).astype(int)
+    green = (image[..., 1] > image[..., 0] + 20) & (image[..., 1] > image[..., 2] + 20)
     assert 50 < green.sum() < 20_000  # the texture's stripe
     env = MemobenchEnv(TASK)
     env.reset(seed=7)

@@ -26,7 +26,7 @@ TASKS = task_names(suite=STRICT)
 ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
-PICTURES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
+IMAGES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
 SALT = "5" * 32
 Json = dict[str, Any]
 
@@ -78,7 +78,7 @@ def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = STRIC
     block = EnvSettings(suite=suite, seed_base=first, replan_steps=5, **settings).protocol_block
     content = card(
         {"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
-        {"type": "act", "seed": first, "settings": {"input_features": PICTURES}, "sha256": tree_hash(FILES)},
+        {"type": "act", "seed": first, "settings": {"input_features": IMAGES}, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
         task_files={name: task_hash(get_task(name)) for name in names},

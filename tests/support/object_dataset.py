@@ -1,4 +1,4 @@
-"""A small LeRobotDataset of objects seen as slots, with or without pictures, for tests of policies."""
+"""A small LeRobotDataset of objects seen as slots, with or without images, for tests of policies."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def record_of(name: str, seed: int, prompt: int, goals: int | None = None) -> st
 def make_object_dataset(
     root: Path,
     seed: int = 0,
-    pictures: bool = False,
+    images: bool = False,
     repeats: int = 1,
     records: bool = False,
     goals: int | None = None,
@@ -70,7 +70,7 @@ def make_object_dataset(
     """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    objects = PRIVILEGED if pictures else OBJECTS
+    objects = PRIVILEGED if images else OBJECTS
     number: dict[str, Any] = {"dtype": "float32", "names": None}
     string = {"dtype": "string", "shape": (1,), "names": None}
     camera = {"dtype": "video", "shape": (48, 48, 3), "names": ["height", "width", "channels"]}
@@ -78,9 +78,9 @@ def make_object_dataset(
         "memobench/objects",
         fps=20,
         root=root,
-        use_videos=pictures,
+        use_videos=images,
         features={
-            **({"observation.images.image": camera} if pictures else {}),
+            **({"observation.images.image": camera} if images else {}),
             "observation.state": number | {"shape": (8,)},
             objects: number | {"shape": (SLOTS * WIDTH,)},
             "action": number | {"shape": (7,)},
@@ -109,7 +109,7 @@ def make_object_dataset(
             }
             if records:
                 frame[EPISODE_INFO] = "" if t else record_of(name, 10_000 + number, prompt, goals)
-            if pictures:
+            if images:
                 frame["observation.images.image"] = np.full((48, 48, 3), t, np.uint8)
             dataset.add_frame(frame)
             hand = hand + 0.01 * way

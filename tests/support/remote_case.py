@@ -17,16 +17,16 @@ PATIENT = {"connect_timeout": 5.0, "timeout": 5.0}
 IMPATIENT = {"connect_timeout": 0.3, "timeout": 0.3}
 
 
-def pictures(step: int, row: int = 0) -> np.ndarray:
+def numbered_image(step: int, row: int = 0) -> np.ndarray:
     """(SIDE, SIDE, 3) uint8 with step and row in their first pixel."""
-    image = np.full((SIDE, SIDE, 3), 90, np.uint8)
-    image[0, 0] = step, row, 255
-    return image
+    array = np.full((SIDE, SIDE, 3), 90, np.uint8)
+    array[0, 0] = step, row, 255
+    return array
 
 
 def batch(*steps: int | None, phase: int = 1, task: str = "do it") -> dict[str, Any]:
     """What LeRobot hands a policy for environments at these steps; None is one that is not simulated."""
-    images = np.stack([pictures(step or 0, row) for row, step in enumerate(steps)])
+    images = np.stack([numbered_image(step or 0, row) for row, step in enumerate(steps)])
     images[[step is None for step in steps]] = 0
     tensor = torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
     state = torch.arange(8.0).repeat(len(steps), 1) + 1

@@ -57,7 +57,7 @@ def beginning(demo: Demonstration, frames: int) -> Demonstration:
     )
 
 
-def with_pictures(demo: Demonstration, size: int) -> Demonstration:
+def with_images(demo: Demonstration, size: int) -> Demonstration:
     """Return it with the cameras' images."""
     sim = Simulation(demo.task, RenderSettings(size, size))
     sim.reset(demo.seed)

@@ -69,15 +69,15 @@ def made_for_training(root: Path, **fields: Any):  # type: ignore[no-untyped-def
 
 
 class Samples:
-    """Samples of a training by global index, with pictures as floats; otherwise LeRobot's dataset."""
+    """Samples of a training by global index, with images as floats; otherwise LeRobot's dataset."""
 
     def __init__(self, training: Training) -> None:
         self._dataset, self._samples = training.dataset, training.samples()
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         found = self._samples[index]
-        pictures = [name for name, value in found.items() if getattr(value, "dtype", None) == torch.uint8]
-        return found | {name: found[name].float() / 255 for name in pictures}
+        images = [name for name, value in found.items() if getattr(value, "dtype", None) == torch.uint8]
+        return found | {name: found[name].float() / 255 for name in images}
 
     def __len__(self) -> int:
         return len(self._dataset)

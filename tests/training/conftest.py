@@ -17,7 +17,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(scope="session")
 def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Pictures of squares, with one prompt; tests that change it copy it."""
+    """Images of squares, with one prompt; tests that change it copy it."""
     from tests.support.synthetic_dataset import make_dataset
 
     return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
@@ -25,18 +25,18 @@ def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Object slots without pictures, with two prompts and records."""
+    """Object slots without images, with two prompts and records."""
     from tests.support.object_dataset import make_object_dataset
 
     return make_object_dataset(tmp_path_factory.mktemp("data") / "objects", records=True)
 
 
 @pytest.fixture(scope="session")
-def pictured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Object slots and pictures, with two prompts."""
+def imaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Object slots and images, with two prompts."""
     from tests.support.object_dataset import make_object_dataset
 
-    return make_object_dataset(tmp_path_factory.mktemp("data") / "pictured", pictures=True)
+    return make_object_dataset(tmp_path_factory.mktemp("data") / "imaged", images=True)
 
 
 @pytest.fixture(scope="session")

@@ -82,17 +82,17 @@ def test_a_view_turns_videos_into_the_other_convention(
 
 @pytest.fixture
 def liberos(tmp_path: Path) -> Path:
-    """A dataset of another package with LIBERO's names, whose pictures are PNG in the tables."""
-    picture = {"dtype": "image", "shape": (16, 24, 3), "names": ["height", "width", "channels"]}
+    """A dataset of another package with LIBERO's names, whose images are PNG in the tables."""
+    image = {"dtype": "image", "shape": (16, 24, 3), "names": ["height", "width", "channels"]}
     numbers = {"dtype": "float32", "shape": (3,), "names": None}
-    features = {**dict.fromkeys(NAMES, picture), "observation.state": numbers, "action": numbers}
+    features = {**dict.fromkeys(NAMES, image), "observation.state": numbers, "action": numbers}
     made = LeRobotDataset.create("local/made", 10, features, root=tmp_path / "made", use_videos=False)
     rng = np.random.default_rng(0)
     for _ in range(2):
         for _ in range(4):
-            pictures = {name: rng.integers(0, 255, picture["shape"], np.uint8) for name in NAMES}
+            images = {name: rng.integers(0, 255, image["shape"], np.uint8) for name in NAMES}
             vectors = {name: rng.random(3, np.float32) for name in ("observation.state", "action")}
-            made.add_frame(pictures | vectors | {"task": "open the drawer"})
+            made.add_frame(images | vectors | {"task": "open the drawer"})
         made.save_episode()
     made.finalize()
     return tmp_path / "made"
@@ -114,11 +114,11 @@ def test_a_view_turns_images_to_the_bit(liberos: Path, tmp_path: Path) -> None:
             assert torch.equal(upright[frame][name], first[frame][name])
 
 
-def test_a_view_needs_pictures_of_a_known_convention(liberos: Path, tmp_path: Path) -> None:
-    objects = write_streams(tmp_path / "objects", pictures=False, frames=3)
+def test_a_view_needs_images_of_a_known_convention(liberos: Path, tmp_path: Path) -> None:
+    objects = write_streams(tmp_path / "objects", images=False, frames=3)
     info = liberos / "meta" / "info.json"
     unknown = info.read_text().replace("images.image2", "images.wrist_image")
-    for root, obs_type, named in ((objects, None, "no pictures"), (liberos, "environment_state_agent_pos", "has")):
+    for root, obs_type, named in ((objects, None, "no images"), (liberos, "environment_state_agent_pos", "has")):
         with pytest.raises(MemobenchError, match=named):
             write_view(root, tmp_path / "view", ViewOptions(obs_type=obs_type, convention="libero"))
     info.write_text(unknown)
@@ -129,7 +129,7 @@ def test_a_view_needs_pictures_of_a_known_convention(liberos: Path, tmp_path: Pa
 
 @pytest.mark.parametrize("dataset", ["upright", "libero"])
 @pytest.mark.parametrize("other", ["upright", "libero"])
-def test_pictures_of_a_training_have_one_convention(
+def test_images_of_a_training_have_one_convention(
     both: dict[str, Path], tmp_path: Path, dataset: str, other: str
 ) -> None:
     """Those of its evaluations, and those of the checkpoint that it continues; memory policies have the same check."""
@@ -149,7 +149,7 @@ def test_pictures_of_a_training_have_one_convention(
             check_environment(config, meta, meta.features)
 
 
-def test_names_of_pictures_in_a_continued_training(
+def test_names_of_images_in_a_continued_training(
     both: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Those of the checkpoint's training, where the dataset has them; else the error proposes a map."""
@@ -172,7 +172,7 @@ def test_names_of_pictures_in_a_continued_training(
     assert renamed() != names
 
 
-def test_a_detector_reads_upright_pictures(both: dict[str, Path]) -> None:
+def test_a_detector_reads_upright_images(both: dict[str, Path]) -> None:
     with pytest.raises(MemobenchError, match="a detector reads upright ones"):
         detected_slots(both["libero"], lambda *_: None, dict(zip(VIEWS, NAMES, strict=True)), "observation.state")  # type: ignore[arg-type]
 
@@ -183,7 +183,7 @@ def test_conformance_needs_the_checkpoints_convention(
     """Without a dataset, its observations have it."""
     theirs, ours = checkpoint(tmp_path, "image", "image2"), checkpoint(tmp_path / "ours", "image", "wrist_image")
     for path, other in ((theirs, "upright"), (ours, "libero")):
-        with pytest.raises(MemobenchError, match=f"expects pictures of convention=.*, and found {other}"):
+        with pytest.raises(MemobenchError, match=f"expects images of convention=.*, and found {other}"):
             load_subject([f"policy={path}", f"dataset={both[other]}"], tmp_path)
     monkeypatch.setattr("lerobot_memobench.conformance.subject.check_weights", lambda *_: 1 / 0)
     with pytest.raises(MemobenchError, match="division by zero"):  # after the observations were written

@@ -147,7 +147,7 @@ def test_null_draws_frames_uniformly(objects: Path) -> None:
 @pytest.mark.parametrize("perception", ["objects", "pixels"])
 def test_chunks_end_at_a_hold(perception: str, tmp_path: Path) -> None:
     """Also those of LeRobot's dataset; statistics are of the frames to learn from."""
-    root = make_held_dataset(tmp_path / "held", pictures=perception == "pixels")
+    root = make_held_dataset(tmp_path / "held", images=perception == "pixels")
     config, training = opened(root, perception=perception, chunk_size=4, n_action_steps=4)
     lookup, samples = training.lookup, training.samples()
     np.testing.assert_array_equal(lookup.acts, ACTS)
@@ -200,14 +200,14 @@ def test_augmentation_follows_seed_and_draw(synthetic: Path) -> None:
     dataset = LeRobotDataset("memobench/synthetic", root=synthetic, image_transforms=transforms, delta_timestamps=times)
     lookup = FrameLookup(synthetic, read_frame_table(synthetic))
 
-    def picture(seed: int, number: int) -> torch.Tensor:
+    def image(seed: int, number: int) -> torch.Tensor:
         found: torch.Tensor = DecodedSamples(dataset, lookup, [0], seed)[5, number]["observation.images.image"]
         return found
 
     state = torch.get_rng_state()
-    first = picture(3, 0)
+    first = image(3, 0)
     assert torch.equal(torch.get_rng_state(), state)
     torch.rand(1)
-    assert torch.equal(picture(3, 0), first)
-    assert not torch.equal(picture(3, 1), first)
-    assert not torch.equal(picture(4, 0), first)
+    assert torch.equal(image(3, 0), first)
+    assert not torch.equal(image(3, 1), first)
+    assert not torch.equal(image(4, 0), first)

@@ -26,7 +26,7 @@ from lerobot_memobench.training import trainer
 from lerobot_memobench.training.trainer import keep_in_memory, open_trainer_datasets, prepare
 from tests.support.held_dataset import make_held_dataset
 
-STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
+STATE, SLOTS, IMAGE = "observation.state", "observation.environment_state", "observation.images.image"
 FEATURES = {STATE: PolicyFeature(FeatureType.STATE, (8,)), SLOTS: PolicyFeature(FeatureType.ENV, (208,))}
 DELTAS = {STATE: [-0.2, -0.05, 0.0], SLOTS: [-0.2, -0.05, 0.0], "action": [0.0, 0.05, 0.1]}
 
@@ -54,14 +54,14 @@ def opened(root: Path, features: dict[str, PolicyFeature] | None = None) -> tupl
     return config, open_trainer_datasets(config)[0]
 
 
-def test_policies_without_pictures_train_from_memory(objects: Path, pictured: Path) -> None:
-    for root, features in ((objects, None), (pictured, FEATURES)):
+def test_policies_without_images_train_from_memory(objects: Path, imaged: Path) -> None:
+    for root, features in ((objects, None), (imaged, FEATURES)):
         config, dataset = opened(root, features)
         del dataset.reader.hf_dataset  # not read any more
         batch = next(iter(DataLoader(dataset, batch_size=5)))
         assert (len(batch["action"]), config.num_workers) == (5, 0)
         assert not [name for name in batch if name.startswith("observation.images")]
-    config, dataset = opened(pictured)
+    config, dataset = opened(imaged)
     assert config.num_workers == 4
     assert "observation.images.image" in dataset[3]
 
@@ -118,15 +118,15 @@ def test_chosen_episodes_are_those_of_the_dataset(tmp_path: Path) -> None:
     assert prepare(config, None, None, print).dataset.episodes == [2, 3]
 
 
-def test_trainings_share_a_view(pictured: Path) -> None:
-    given, notes = config_of(pictured, "policy=act"), list[str]()
+def test_trainings_share_a_view(imaged: Path) -> None:
+    given, notes = config_of(imaged, "policy=act"), list[str]()
     for _ in range(2):
         folder = Path(str(prepare(given, None, OBJECTS, notes.append).dataset.root))
-    assert {*LeRobotDataset("local/data", root=folder).meta.features} & {STATE, SLOTS, PICTURE} == {STATE, SLOTS}
+    assert {*LeRobotDataset("local/data", root=folder).meta.features} & {STATE, SLOTS, IMAGE} == {STATE, SLOTS}
     assert not [note for note in notes if "pixels" in note]
     assert [*folder.parent.iterdir()] == [folder]
     inputs = prepare(given, True, None, notes.append).policy.input_features
-    assert PICTURE in inputs
+    assert IMAGE in inputs
     assert "observation.phase" not in inputs
     (note,) = (note for note in notes if "pixels" in note)
     assert "observation_height=48 observation_width=48" in note

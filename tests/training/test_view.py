@@ -18,7 +18,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.training.view import ViewOptions, write_view
 from tests.support.held_dataset import LENGTHS, STRETCHES, make_held_dataset
 
-STATE, SLOTS, PICTURE = "observation.state", "observation.environment_state", "observation.images.image"
+STATE, SLOTS, IMAGE = "observation.state", "observation.environment_state", "observation.images.image"
 
 
 def opened(root: Path, **options: Any) -> LeRobotDataset:
@@ -32,8 +32,8 @@ def inputs(root: Path) -> set[str]:
 
 
 def test_stretches_between_prompts_and_holds_are_episodes(tmp_path: Path) -> None:
-    """Chunks and windows end with them; pictures, objects and texts stay those of the frames."""
-    root = make_held_dataset(tmp_path / "held", pictures=True)
+    """Chunks and windows end with them; images, objects and texts stay those of the frames."""
+    root = make_held_dataset(tmp_path / "held", images=True)
     write_view(root, tmp_path / "view", ViewOptions(obs_type=BOTH))
     times = {"action": [0.0, 0.05, 0.1], STATE: [-0.05, 0.0]}
     whole, view = opened(root), opened(tmp_path / "view", delta_timestamps=times)
@@ -46,7 +46,7 @@ def test_stretches_between_prompts_and_holds_are_episodes(tmp_path: Path) -> Non
         assert place["source_episode_index"] == (start >= LENGTHS[0])
         for frame in range(start, end):
             there, here = whole[frame], view[row]
-            assert torch.equal(here[PICTURE], there[PICTURE]), (episode, frame)
+            assert torch.equal(here[IMAGE], there[IMAGE]), (episode, frame)
             assert torch.equal(here[SLOTS], there["privileged.environment_state"])
             assert torch.equal(here[STATE][1], there[STATE])
             assert torch.equal(here["action"][0], there["action"])
@@ -60,19 +60,19 @@ def test_stretches_between_prompts_and_holds_are_episodes(tmp_path: Path) -> Non
                 age = float(there["timestamp"]) - float(old["timestamp"])
                 assert float(here["timestamp"]) - float(new["timestamp"]) == pytest.approx(age, abs=1e-5)
             row += 1
-    assert not torch.equal(view[0][PICTURE], view[row - 1][PICTURE])
+    assert not torch.equal(view[0][IMAGE], view[row - 1][IMAGE])
 
 
 @pytest.mark.parametrize(
     ("obs_type", "seen"),
-    [(PIXELS, {STATE, PICTURE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, PICTURE})],
+    [(PIXELS, {STATE, IMAGE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, IMAGE})],
 )
-def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], pictured: Path, tmp_path: Path) -> None:
-    write_view(pictured, tmp_path / "view", ViewOptions(obs_type=obs_type))
+def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], imaged: Path, tmp_path: Path) -> None:
+    write_view(imaged, tmp_path / "view", ViewOptions(obs_type=obs_type))
     assert inputs(tmp_path / "view") == seen
     stats = opened(tmp_path / "view").meta.stats
     assert seen <= {*stats}
-    assert np.array_equal(stats[STATE]["mean"], opened(pictured).meta.stats[STATE]["mean"])
+    assert np.array_equal(stats[STATE]["mean"], opened(imaged).meta.stats[STATE]["mean"])
 
 
 @pytest.mark.parametrize(("data", "obs_type"), [("synthetic", OBJECTS), ("objects", PIXELS), ("objects", BOTH)])
@@ -84,12 +84,12 @@ def test_missing_observations_are_refused(
     assert not (tmp_path / "view").exists()
 
 
-def test_command_writes_a_view(pictured: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_a_view(imaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "view"
-    assert memobench(["view", str(pictured), "--obs-type", OBJECTS, "--out", str(out)]) == 0
+    assert memobench(["view", str(imaged), "--obs-type", OBJECTS, "--out", str(out)]) == 0
     assert inputs(out) == {STATE, SLOTS}
     for words in (["--out", str(out)], ["--out", str(tmp_path / "b"), "--obs-type", "some"]):
-        assert memobench(["view", str(pictured), *words]) == 2
+        assert memobench(["view", str(imaged), *words]) == 2
     assert memobench(["view", str(out), "--out", str(tmp_path / "again")]) == 0
     first, again = opened(out), opened(tmp_path / "again")
     assert len(first) == len(again)

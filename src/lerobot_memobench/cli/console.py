@@ -41,7 +41,7 @@ SuiteOption = Annotated[
     AnySuite,
     typer.Option(
         help="published: the thirty tasks as published; strict: their memory-necessary variants, whose answer no "
-        "picture shows; libero_…: LIBERO's own."
+        "image shows; libero_…: LIBERO's own."
     ),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]

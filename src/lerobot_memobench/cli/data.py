@@ -154,13 +154,13 @@ def cache(
         typer.Option(min=1, help="Keep every how many frames (policy.memory_stride); 8 at size small, else 1."),
     ] = None,
     perception: Annotated[
-        str, typer.Option(help="pixels; or objects, detected in the pictures (policy.perception).")
+        str, typer.Option(help="pixels; or objects, detected in the images (policy.perception).")
     ] = "pixels",
     detector: Annotated[
         str | None, typer.Option(help="With objects, the detector (policy.detector): package or a file.")
     ] = None,
     visual_encoder: Annotated[
-        str | None, typer.Option(help="At size small, the encoder of pictures (policy.visual_encoder); the package's.")
+        str | None, typer.Option(help="At size small, the encoder of images (policy.visual_encoder); the package's.")
     ] = None,
     weights: Annotated[str | None, typer.Option(help="Folder or repository with the image tower (size pi05).")] = None,
     device: Annotated[str | None, typer.Option(help="cuda or cpu; the best there is by default.")] = None,
@@ -203,11 +203,11 @@ def view(
     dataset: Annotated[Path, typer.Argument(help="Folder of a LeRobotDataset.")],
     out: Annotated[Path, typer.Option(help="Folder to write; its videos are links to the dataset's.")],
     obs_type: Annotated[
-        str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; pictures if there are some by default.")
+        str | None, typer.Option(help=f"Inputs: {', '.join(OBS_TYPES)}; images if there are some by default.")
     ] = None,
     prompts: Annotated[bool, typer.Option(help="Keep the frames of demonstration prompts and holds.")] = False,
     convention: Annotated[
-        str | None, typer.Option(help="Pictures upright, or libero: mirrored. Those of the dataset by default.")
+        str | None, typer.Option(help="Images upright, or libero: mirrored. Those of the dataset by default.")
     ] = None,
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""

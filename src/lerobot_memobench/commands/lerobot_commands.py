@@ -90,13 +90,13 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     check_actions(path, policy)
     if policy.type == "xvla":
         raise MemobenchError(
-            "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror a picture and convert actions; "
+            "lerobot-eval runs every XVLA with the processors of LIBERO, which mirror an image and convert actions; "
             f"run `lerobot eval env=memobench policy={path}`"
         )
     stated = requested.get("env.convention") or (MIRRORED if environment.camera_name_mapping else None)
     renamed = requested.build_field("rename_map") or {}
     convention = chosen_convention(path, policy, stated, renamed)
-    if convention not in (None, environment.convention):  # with the names of its pictures
+    if convention not in (None, environment.convention):  # with the names of its images
         names = {"features": policy_features(), "features_map": policy_names()}
         vars(environment).update(vars(replace(environment, **names, convention=convention)))
     return policy, acting(policy, path, environment.settings)

@@ -31,10 +31,10 @@ THINGS = 4
 
 
 def write_streams(
-    folder: Path, pictures: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
+    folder: Path, images: bool = True, frames: int = EXECUTION_FRAMES, task: str = TASK, convention: str = UPRIGHT
 ) -> Path:
     """Write a dataset of three episodes of few execution frames, with real columns and shapes and synthetic values."""
-    episodes = (_episode(get_task(task), seed, prompt, pictures, frames) for seed, prompt in enumerate(PROMPTS))
+    episodes = (_episode(get_task(task), seed, prompt, images, frames) for seed, prompt in enumerate(PROMPTS))
     return write_dataset(episodes, folder, convention=convention)
 
 
@@ -51,7 +51,7 @@ def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
     return TASK if best is None else best.name
 
 
-def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) -> Demonstration:
+def _episode(task: Task, seed: int, prompt: int, images: bool, frames: int) -> Demonstration:
     """Return an episode with smooth random motions of an arm and some objects."""
     rng, length = np.random.default_rng(seed), prompt + frames
     count = len(task.checkpoints)
@@ -76,7 +76,7 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
         states=np.zeros((length, 1)),
         actions=moving(ACTION_DIM),
         proprio=np.array([0, 0, 1.1, 3.1, 0, 0, 0, 0], np.float32) + 0.1 * moving(PROPRIO_DIM),
-        images={name: _pictures(rng, moving(2)) for name in CAMERAS} if pictures else None,
+        images={name: _images(rng, moving(2)) for name in CAMERAS} if images else None,
         exec_start=prompt,
         satisfied=np.arange(length)[:, None] >= completed,
         success=True,
@@ -84,14 +84,14 @@ def _episode(task: Task, seed: int, prompt: int, pictures: bool, frames: int) ->
     )
 
 
-def _pictures(rng: np.random.Generator, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _images(rng: np.random.Generator, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a coloured square that moves along positions (T, 2) in [-1, 1]."""
-    pictures = np.full((len(positions), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
+    images = np.full((len(positions), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
     corners = ((positions + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
-    for picture, (top, left) in zip(pictures, corners, strict=True):
-        picture[top : top + side, left : left + side] = colour
-    return pictures
+    for image, (top, left) in zip(images, corners, strict=True):
+        image[top : top + side, left : left + side] = colour
+    return images
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,14 @@ class Stream:
         return replace(self, frames=tuple(shown.get(call, frame) for call, frame in enumerate(self.frames)))
 
 
-def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
+def read_streams(dataset: Any, images: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
     """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
 
     Held frames are part of a memory's history in training; a policy that reads no prompt does not train on them.
 
     Args:
         dataset: without delta timestamps.
-        pictures: whether cameras are observed. objects: the observed column of object state, or None.
+        images: whether cameras are observed. objects: the observed column of object state, or None.
         prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
         frames: number of execution frames that are not held.
     """
@@ -160,14 +160,14 @@ def read_streams(dataset: Any, pictures: bool, objects: str | None, prompts: boo
     for _, indices, task in episodes:
         shown: list[dict[str, Tensor]] = []
         for index in indices:
-            item = dataset[index] if pictures else dataset.hf_dataset[index]
+            item = dataset[index] if images else dataset.hf_dataset[index]
             frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
-            frame |= {key: _as_float(item[key]) for key in item if pictures and key.startswith(f"{OBS_IMAGES}.")}
+            frame |= {key: _as_float(item[key]) for key in item if images and key.startswith(f"{OBS_IMAGES}.")}
             frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
             shown.append(frame)
         yield Stream(tuple(shown), task, indices)
 
 
-def _as_float(picture: Tensor) -> Tensor:
-    """Return a picture in [0, 1], as LeRobot's training loop gives it to a policy."""
-    return picture.to(torch.float32) / 255 if picture.dtype == torch.uint8 else picture
+def _as_float(image: Tensor) -> Tensor:
+    """Return an image in [0, 1], as LeRobot's training loop gives it to a policy."""
+    return image.to(torch.float32) / 255 if image.dtype == torch.uint8 else image

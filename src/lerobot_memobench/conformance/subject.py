@@ -88,7 +88,7 @@ class Subject:
 
         Args:
             equal_noise: let every row and call draw the same noise, so that actions can be compared.
-            sparing: repeat earlier pictures and objects if the policy does not need new ones, and everything except
+            sparing: repeat earlier images and objects if the policy does not need new ones, and everything except
                 the clock if its next action is planned already, as evaluations do.
         """
         actions, answers = ActionQueue(self.policy), []

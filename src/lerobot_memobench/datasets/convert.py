@@ -96,7 +96,7 @@ def convert(
 ) -> ConversionSummary:
     """Convert a file in the published layout, or all in a folder or a zip archive, to a LeRobotDataset in ``out``.
 
-    The first pictures of each file, compared with those drawn of their state, show how all of them are stored.
+    The first images of each file, compared with those drawn of their state, show how all of them are stored.
 
     Args:
         source: the file, folder or archive.

@@ -250,7 +250,7 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
 
 
 class SamplesInMemory(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their rows, from columns in main memory, without pictures.
+    """LeRobot's samples by their rows, from columns in main memory, without images.
 
     Args:
         columns: name -> numbers (N, ...).

@@ -186,19 +186,19 @@ def _simulation(task: Task) -> Simulation:
     return sim
 
 
-# --- the orientation of stored pictures ---
+# --- the orientation of stored images ---
 
 STORED = (UPRIGHT, "mirrored left to right", "upside down", "rotated by 180 degrees")
 ORIENTATIONS = {name: (rows, columns) for name, (rows, columns) in zip(STORED, product((1, -1), repeat=2), strict=True)}
-"""How pictures are stored -> steps over their rows and columns that make them upright."""
+"""How images are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0
-"""Largest mean difference of pictures of one frame, of 255 levels, and the least ratio to the next orientation's."""
+"""Largest mean difference of images of one frame, of 255 levels, and the least ratio to the next orientation's."""
 SIDE = 32
-"""Side at which pictures are compared, pixels: edges and textures of other renderers do not count."""
+"""Side at which images are compared, pixels: edges and textures of other renderers do not count."""
 
 
 def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
-    """Return which of `ORIENTATIONS` the first pictures of a checked group have, by those drawn of its first state.
+    """Return which of `ORIENTATIONS` the first images of a checked group have, by those drawn of its first state.
 
     None if none is near, or two are. `Unusable` if the group has no task, or is of another scene than the task's.
     """
@@ -206,17 +206,17 @@ def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
     states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
     sim.set_state(states[0], fixture_poses)
     stored = next(file.images(demo.group)).items()
-    pairs = [(_small(sim.render(CAMERAS[camera])), _small(picture)) for camera, picture in stored]
+    pairs = [(_small(sim.render(CAMERAS[camera])), _small(image)) for camera, image in stored]
     far = {
-        name: float(np.mean([np.abs(drawn - picture[::rows, ::columns]) for drawn, picture in pairs]))
+        name: float(np.mean([np.abs(drawn - image[::rows, ::columns]) for drawn, image in pairs]))
         for name, (rows, columns) in ORIENTATIONS.items()
     }
     best, second = sorted(far, key=lambda name: far[name])[:2]
     return best if far[best] <= NEAR and far[second] >= APART * far[best] else None
 
 
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
+def _small(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.asarray(Image.fromarray(image).resize((SIDE, SIDE), Image.Resampling.BOX), np.float32)
 
 
 # --- the scene of a model file ---

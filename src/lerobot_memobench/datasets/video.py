@@ -68,8 +68,8 @@ class VideoWriter:
             self._stream = self._container.add_stream(encoder.vcodec, self._rate, options=options)
             self._stream.pix_fmt = encoder.pix_fmt
             self._stream.height, self._stream.width = frame.shape[:2]
-        picture = av.VideoFrame.from_ndarray(frame, format="rgb24")
-        self._container.mux(self._stream.encode(picture))
+        image = av.VideoFrame.from_ndarray(frame, format="rgb24")
+        self._container.mux(self._stream.encode(image))
 
     def close(self) -> None:
         """Flush the encoder and end the file."""
@@ -199,7 +199,7 @@ def frame_reader(root: Path, camera: str) -> FrameReader:
         meta = LeRobotDatasetMetadata(root.name, root=without_pattern(root))
     if not meta.camera_keys:
         raise MemobenchError(
-            f"{root} holds no pictures, which a detector and perception=pixels need; name a dataset with images, or "
+            f"{root} holds no images, which a detector and perception=pixels need; name a dataset with images, or "
             "leave detector out with perception=objects"
         )
     if camera not in meta.camera_keys:

@@ -436,7 +436,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
         return blank(self.observation_space), float(success), success, not success, self._info(success)
 
     def render(self) -> Any:
-        """Return the environment's picture; black for a skipped episode."""
+        """Return the environment's image; black for a skipped episode."""
         return self.env.render() if self._skipped is None else _black(self._settings)
 
     def _info(self, success: bool) -> dict[str, Any]:

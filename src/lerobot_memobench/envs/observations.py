@@ -78,15 +78,15 @@ def _ignores_objects(policy: Any) -> bool:
 
 
 def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
-    """Raise `MemobenchError` unless an ``obs_type`` contains the inputs of a policy; LIBERO's have pictures alone."""
+    """Raise `MemobenchError` unless an ``obs_type`` contains the inputs of a policy; LIBERO's have images alone."""
     needed = obs_type_of(policy)
     if needed is not None and obs_type not in (needed, BOTH):
         wanted = BOTH if needed == BOTH else f"{needed} or {BOTH}"
         extra = "" if needed == PIXELS else f" ({PRIVILEGED})"
         if suite in LIBERO_SUITES:
             raise MemobenchError(
-                f"{policy.type} reads more than pictures{extra}, and suite={suite} has pictures alone; evaluate it in "
-                "memory tasks, or name a policy that reads pictures"
+                f"{policy.type} reads more than images{extra}, and suite={suite} has images alone; evaluate it in "
+                "memory tasks, or name a policy that reads images"
             )
         raise MemobenchError(f"env.obs_type is {obs_type}, which lacks inputs of the policy{extra}; set it to {wanted}")
 
@@ -125,10 +125,10 @@ def policy_features(settings: EnvSettings = DEFAULTS) -> dict[str, PolicyFeature
     """Return LeRobot's features of actions and observations, by the environment's names."""
     from lerobot.configs import FeatureType, PolicyFeature
 
-    picture = (settings.observation_height, settings.observation_width, 3)
+    image = (settings.observation_height, settings.observation_width, 3)
     shapes: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
         "action": (FeatureType.ACTION, (ACTION_DIM,)),
-        **dict.fromkeys(_pictures(settings), (FeatureType.VISUAL, picture)),
+        **dict.fromkeys(_image_keys(settings), (FeatureType.VISUAL, image)),
         **({"environment_state": (FeatureType.ENV, (SIZE,))} if settings.obs_type != PIXELS else {}),
         "agent_pos": (FeatureType.STATE, (PROPRIO_DIM,)),
     }
@@ -139,14 +139,14 @@ def policy_names(settings: EnvSettings = DEFAULTS) -> dict[str, str]:
     """Return the environment's name -> the policy's name of each feature."""
     return {
         "action": "action",
-        **_pictures(settings),
+        **_image_keys(settings),
         **({"environment_state": "observation.environment_state"} if settings.obs_type != PIXELS else {}),
         "agent_pos": "observation.state",
     }
 
 
-def _pictures(settings: EnvSettings) -> dict[str, str]:
-    names = () if settings.obs_type == OBJECTS else settings.pictures.values()
+def _image_keys(settings: EnvSettings) -> dict[str, str]:
+    names = () if settings.obs_type == OBJECTS else settings.images.values()
     return {f"pixels/{name}": f"observation.images.{name}" for name in names}
 
 
@@ -163,7 +163,7 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
     }
     if settings.obs_type != OBJECTS:
         image = spaces.Box(0, 255, (settings.observation_height, settings.observation_width, 3), np.uint8)
-        parts["pixels"] = spaces.Dict(dict.fromkeys(settings.pictures.values(), image))
+        parts["pixels"] = spaces.Dict(dict.fromkeys(settings.images.values(), image))
     if settings.obs_type != PIXELS:
         low, high = (np.tile(np.repeat(ends, [*FIELDS.values()]), SLOTS) for ends in zip(*BOUNDS.values(), strict=True))
         parts["environment_state"] = spaces.Box(low.astype(np.float32), high.astype(np.float32), (SIZE,), np.float32)
@@ -197,7 +197,7 @@ def blank(space: spaces.Space[Any]) -> Any:
 
 
 class Observer:
-    """Render pictures and compute objects only for frames that are read.
+    """Render images and compute objects only for frames that are read.
 
     Attributes:
         needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
@@ -206,44 +206,44 @@ class Observer:
 
     def __init__(self, settings: EnvSettings) -> None:
         self._convention, self._mapping = settings.convention, settings.camera_name_mapping
-        self._has_pictures, self._has_objects = settings.obs_type != OBJECTS, settings.obs_type != PIXELS
+        self._has_images, self._has_objects = settings.obs_type != OBJECTS, settings.obs_type != PIXELS
         self.needed = True
 
     def begin(self, episode: Episode) -> None:
         """Observe the first frame of an episode."""
         self.needed = True
-        self._picture_step: int | None = None
-        self._pictures_at_rest = self._objects_at_rest = False
+        self._image_step: int | None = None
+        self._images_at_rest = self._objects_at_rest = False
         self.observe(episode, recorded=False)
 
     def observe(self, episode: Episode, *, recorded: bool) -> None:
         """Observe the current frame if it is needed; ``recorded``: it is part of a video."""
         always = episode.done or episode.step_index == episode.exec_start or episode.corrupts
         if not episode.at_rest:
-            self._pictures_at_rest = self._objects_at_rest = False
+            self._images_at_rest = self._objects_at_rest = False
         if self._has_objects and (always or self.needed) and not self._objects_at_rest:
             self._objects = episode.objects()
             self._objects_at_rest = episode.at_rest
-        if self._has_pictures and (always or self.needed or recorded):
+        if self._has_images and (always or self.needed or recorded):
             self._render(episode)
 
     def _render(self, episode: Episode) -> None:
-        if not self._pictures_at_rest:  # render a scene at rest once
+        if not self._images_at_rest:  # render a scene at rest once
             self._images: dict[str, Image] = episode.images()
-        self._pictures_at_rest = episode.at_rest
-        self._picture_step = episode.step_index
+        self._images_at_rest = episode.at_rest
+        self._image_step = episode.step_index
 
     def observation(self) -> dict[str, Any]:
-        """Return the pictures and objects of the observation, see `observation_space`."""
+        """Return the images and objects of the observation, see `observation_space`."""
         observation: dict[str, Any] = {}
-        if self._has_pictures:
+        if self._has_images:
             observation["pixels"] = in_convention(self._images, self._convention, self._mapping)
         if self._has_objects:
             observation["environment_state"] = self._objects.copy()  # may be returned again
         return observation
 
     def frame(self, episode: Episode) -> NDArray[np.uint8]:
-        """Return both annotated cameras: last rendered, or rendered now if observations contain no pictures."""
-        if not self._has_pictures and self._picture_step != episode.step_index:
+        """Return both annotated cameras: last rendered, or rendered now if observations contain no images."""
+        if not self._has_images and self._image_step != episode.step_index:
             self._render(episode)
         return annotate(self._images, episode)

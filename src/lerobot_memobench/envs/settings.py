@@ -25,7 +25,7 @@ from lerobot_memobench.constants import (
     UPSTREAM_HORIZON,
 )
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, picture_names
+from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, image_names
 from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
 from lerobot_memobench.tasks.task import (
     DIFFICULTIES,
@@ -57,19 +57,19 @@ SLOWEST = 10
 """Maximum number of control steps per action, see ``speed``."""
 
 SMALLEST, LARGEST = 16, 2048
-"""Least and greatest height and width of pictures, pixels."""
+"""Least and greatest height and width of images, pixels."""
 
 EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'
 """A value of ``camera_name_mapping``."""
-PICTURE_NAME = re.compile("[A-Za-z0-9_]+")
+IMAGE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
 INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
 """Values of ``corrupt``: what happens to the memory of the policy."""
 
-PICTURES = {"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
-"""Settings of pictures, with the values that a log omits."""
+IMAGE_SETTINGS = {"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
+"""Settings of images, with the values that a log omits."""
 MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
 """Settings of corruption and interference, with their values in the protocol."""
 
@@ -127,13 +127,13 @@ class EnvSettings:
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0, usual="that of seed= or split=")
     obs_type: str = setting(
         PIXELS,
-        "observations: the arm's state with pictures, with object slots, or with both",
+        "observations: the arm's state with images, with object slots, or with both",
         OBS_TYPES,
-        usual="what the policy was trained on, else pictures",
+        usual="what the policy was trained on, else images",
     )
     convention: str = setting(
         None,
-        "pictures upright (image, wrist_image), or libero: mirrored left to right (image, image2), as checkpoints of "
+        "images upright (image, wrist_image), or libero: mirrored left to right (image, image2), as checkpoints of "
         "LIBERO need them",
         [*CONVENTIONS],
         usual="the checkpoint's; else upright, in suites of LIBERO libero",
@@ -143,8 +143,8 @@ class EnvSettings:
         f"LeRobot's mapping of LIBERO's names of the cameras, such as {EXAMPLE}; means convention=libero",
         usual="image, image2",
     )
-    observation_height: int = setting(IMAGE_SIZE, "height of pictures, pixels, an even number", least=SMALLEST)
-    observation_width: int = setting(IMAGE_SIZE, "width of pictures, pixels, an even number", least=SMALLEST)
+    observation_height: int = setting(IMAGE_SIZE, "height of images, pixels, an even number", least=SMALLEST)
+    observation_width: int = setting(IMAGE_SIZE, "width of images, pixels, an even number", least=SMALLEST)
     control_mode: str = setting(RELATIVE, "actions are displacements; LIBERO's absolute ones are refused")
     referent: str = setting(
         "fixed",
@@ -206,7 +206,7 @@ class EnvSettings:
         0,
         "number of first episodes of each task recorded as videos; -1 for all",
         least=EVERY,
-        usual="10, without pictures in the observations 0",
+        usual="10, without images in the observations 0",
     )
 
     def __post_init__(self) -> None:
@@ -229,7 +229,7 @@ class EnvSettings:
             )
         if self.suite in LIBERO_SUITES:
             self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
-        self._check_pictures()
+        self._check_images()
         if self.suite == STRICT:
             self._set(referent=DRAWN)
         elif self.difficulty != STANDARD:
@@ -246,33 +246,33 @@ class EnvSettings:
             )
         self._check_memory_controls()
 
-    def _check_pictures(self) -> None:
+    def _check_images(self) -> None:
         height, width = self.observation_height, self.observation_width
         if height % 2 or width % 2 or max(height, width) > LARGEST:
             raise MemobenchError(
                 f"observation_height and observation_width are {height} and {width}; expected even numbers up to "
                 f"{LARGEST}"
             )
-        for name, default in PICTURES.items():
+        for name, default in IMAGE_SETTINGS.items():
             if self.obs_type == OBJECTS and (value := getattr(self, name)) != default:
-                raise MemobenchError(f"{name}={value} is of pictures, and obs_type={OBJECTS} has none; leave it out")
+                raise MemobenchError(f"{name}={value} is of images, and obs_type={OBJECTS} has none; leave it out")
         if (mapping := self.camera_name_mapping) is None:
             return
         if self.convention != MIRRORED:
             raise MemobenchError(
-                f"camera_name_mapping= names LIBERO's pictures, and convention is {self.convention}; set "
+                f"camera_name_mapping= names LIBERO's images, and convention is {self.convention}; set "
                 f"convention={MIRRORED}, or leave camera_name_mapping out"
             )
-        if not _names_pictures(mapping):
+        if not _names_images(mapping):
             raise MemobenchError(
                 f"camera_name_mapping is {mapping!r}; expected different names of letters, digits and _ for "
                 f"{' and '.join(LIBERO_CAMERAS.values())}, as in {EXAMPLE}"
             )
 
     @property
-    def pictures(self) -> dict[str, str]:
-        """Camera -> name of its picture."""
-        return picture_names(self.convention, self.camera_name_mapping)
+    def images(self) -> dict[str, str]:
+        """Camera -> name of its image."""
+        return image_names(self.convention, self.camera_name_mapping)
 
     def _check_memory_controls(self) -> None:
         if self.corrupt_step and (self.corrupt == INTACT or self.reshow):
@@ -373,11 +373,11 @@ def steps_per_action(speed: float) -> int:
     return round(1 / speed)
 
 
-def _names_pictures(mapping: Any) -> bool:
+def _names_images(mapping: Any) -> bool:
     if not isinstance(mapping, Mapping) or not {*mapping} <= {*LIBERO_CAMERAS.values()}:
         return False
-    names = [*picture_names(MIRRORED, mapping).values()]
-    return all(isinstance(name, str) and PICTURE_NAME.fullmatch(name) for name in names) and len({*names}) == len(names)
+    names = [*image_names(MIRRORED, mapping).values()]
+    return all(isinstance(name, str) and IMAGE_NAME.fullmatch(name) for name in names) and len({*names}) == len(names)
 
 
 DEFAULTS = EnvSettings()

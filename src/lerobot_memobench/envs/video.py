@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode
 
 BAND, MARGIN = 64, 8
-"""Height of the text above the pictures, and margin at its sides, pixels."""
+"""Height of the text above the images, and margin at its sides, pixels."""
 CLOCK, CLOCK_BOTTOM = 96, 24
 """Width reserved for the clock, and its lower edge from the top, pixels."""
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
@@ -55,8 +55,8 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     It shows both cameras, the instruction, the next checkpoint, and a tick for each completed one. The text is cached
     between checkpoints, the clock's word and digits for the whole process.
     """
-    pictures = list(images.values())
-    height, width = pictures[0].shape[0], sum(picture.shape[1] for picture in pictures)
+    views = list(images.values())
+    height, width = views[0].shape[0], sum(view.shape[1] for view in views)
     frame = np.empty((BAND + height, width, 3), np.uint8)
     prompt = episode.phase == PROMPT
     operations = tuple(checkpoint.operation for checkpoint in episode.task.checkpoints)
@@ -67,7 +67,7 @@ def annotate(images: dict[str, NDArray[np.uint8]], episode: Episode) -> NDArray[
     pieces = ("prompt ", *str(episode.step_index)) if prompt else ("step ", *str(episode.exec_steps))
     clock = np.concatenate([_piece(piece, prompt) for piece in pieces], axis=1)[:, : width - 2 * MARGIN]
     frame[:CLOCK_BOTTOM, width - MARGIN - clock.shape[1] : width - MARGIN] = clock
-    np.concatenate(pictures, axis=1, out=frame[BAND:])
+    np.concatenate(views, axis=1, out=frame[BAND:])
     return frame
 
 
@@ -172,5 +172,5 @@ class VideoRecorder:
         self._stream = self._container.add_stream("libx264", rate=CONTROL_HZ, options=options)
         self._stream.height, self._stream.width, self._stream.pix_fmt = height, width, "yuv420p"
 
-    def _encode(self, picture: VideoFrame) -> None:
-        self._container.mux(self._stream.encode(picture))
+    def _encode(self, image: VideoFrame) -> None:
+        self._container.mux(self._stream.encode(image))

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 from lerobot_memobench.constants import PAPER, SPLITS
 from lerobot_memobench.envs.evaluation_file import POLICY
-from lerobot_memobench.envs.settings import DEFAULTS, MEMORY_CONTROLS, PICTURES
+from lerobot_memobench.envs.settings import DEFAULTS, IMAGE_SETTINGS, MEMORY_CONTROLS
 from lerobot_memobench.evaluation.metrics import Record, inputs_phrase, stand_ins_of
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
-OF_SCENES = ("difficulty", "protocol", *PICTURES)
+OF_SCENES = ("difficulty", "protocol", *IMAGE_SETTINGS)
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 

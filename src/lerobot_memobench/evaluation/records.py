@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
 from lerobot_memobench.envs.evaluation_file import EXTENT, MOST_EPISODES, POLICY, differences, read_evaluation
-from lerobot_memobench.envs.settings import PICTURES, SCENE_HASHES
+from lerobot_memobench.envs.settings import IMAGE_SETTINGS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, summary_of
@@ -191,7 +191,7 @@ def _joined(parts: Sequence[Run]) -> Run:
                 f"{a.folder} and {b.folder} are of {same}, and an average over suites of LIBERO is of one policy "
                 "and each suite once; give the folders of each policy one name: A=FOLDER A=FOLDER B=FOLDER"
             )
-        for name in PICTURES:
+        for name in IMAGE_SETTINGS:
             if a.protocol.get(name) != b.protocol.get(name):
                 raise MemobenchError(f"{a.folder} and {b.folder} differ in {name}; report each by itself")
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}

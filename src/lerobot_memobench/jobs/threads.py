@@ -1,6 +1,6 @@
 """Set the number of threads of this package's processes and their libraries.
 
-A rollout is sequential: a small policy, physics and both pictures use one core, and a second thread of torch or of the
+A rollout is sequential: a small policy, physics and both images use one core, and a second thread of torch or of the
 renderer only spins until the next step. So a process that simulates has one thread of each, and more cores mean more
 processes. Training and large policies multiply large matrices: they use all cores of their process, shared among this
 package's processes on the machine.

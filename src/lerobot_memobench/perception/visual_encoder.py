@@ -29,7 +29,7 @@ def area_averaged(images: Tensor) -> Tensor:
     height, width = images.shape[-2:]
     if height != width:
         raise MemobenchError(
-            f"found pictures of {height} x {width} pixels, and the visual encoder and the detector read square ones; "
+            f"found images of {height} x {width} pixels, and the visual encoder and the detector read square ones; "
             "set observation_height and observation_width to one number"
         )
     images = images.to(torch.float32)

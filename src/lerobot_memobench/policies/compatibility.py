@@ -1,6 +1,6 @@
-"""Check that a policy's inputs fit an environment: its observations, and the convention of its pictures.
+"""Check that a policy's inputs fit an environment: its observations, and the convention of its images.
 
-A policy runs on pictures of the convention (`sim.convention`) of its training, or is refused. Each check raises
+A policy runs on images of the convention (`sim.convention`) of its training, or is refused. Each check raises
 `MemobenchError`.
 """
 
@@ -41,8 +41,8 @@ SIZE_COUNTS = {
     "vqbet": None,
     "xvla": "resize_imgs_with_padding",
 }
-"""LeRobot's policies that read pictures in the environment's size -> their setting that resizes pictures, if any. All
-others resize every picture to a fixed size."""
+"""LeRobot's policies that read images in the environment's size -> their setting that resizes images, if any. All
+others resize every image to a fixed size."""
 EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"
 """Prefix of the cameras that LeRobot's ``policy.empty_cameras`` adds; no environment has them."""
 OF_LIBERO = ("lerobot/", "HuggingFaceVLA/", "physical-intelligence/")
@@ -75,10 +75,10 @@ def check_actions(path: str, policy: Any) -> None:
 def check_features(
     path: str, policy: PreTrainedConfig, shown: Mapping[str, PolicyFeature], renamed: Mapping[str, str]
 ) -> None:
-    """Refuse other cameras, or vectors or pictures of other sizes, than a checkpoint was trained on.
+    """Refuse other cameras, or vectors or images of other sizes, than a checkpoint was trained on.
 
     LeRobot compares only the names of cameras, and only without a ``rename_map``. Policies that pad vectors, and those
-    that read pictures of any size, would act on inputs unlike their training data.
+    that read images of any size, would act on inputs unlike their training data.
 
     Args:
         shown: features of the environment's observations and action, by LeRobot's names.
@@ -114,7 +114,7 @@ def check_features(
 def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     """Return the cameras that a policy needs.
 
-    A policy that fills missing pictures may list cameras of the checkpoint that its training began with; it needs those
+    A policy that fills missing images may list cameras of the checkpoint that its training began with; it needs those
     of its training data, which its statistics name. Without such names, LeRobot's ``policy.empty_cameras`` fills the
     last ones.
     """
@@ -134,7 +134,7 @@ def _check_cameras(path: str, cameras: list[str], original: Mapping[str, str]) -
     inputs = f"the policy {path} reads {', '.join(cameras)}, and the environment has {_list(original)}"
     if len(free) < len(missing):
         raise MemobenchError(
-            f"{inputs}, no picture for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
+            f"{inputs}, no image for {', '.join(missing[len(free) :])}; train without it, or on a dataset of "
             "this environment"
         )
     mapped = {name: known for known, name in original.items() if known in cameras and known != name}
@@ -158,7 +158,7 @@ def _length(policy: Any, name: str, feature: PolicyFeature, trained: Mapping[str
 
 
 def keeps_sizes(policy: PreTrainedConfig) -> bool:
-    """Return whether a policy reads pictures in the size of its training data alone."""
+    """Return whether a policy reads images in the size of its training data alone."""
     resizes = SIZE_COUNTS.get(policy.type)
     return policy.type in SIZE_COUNTS and (resizes is None or getattr(policy, resizes) is None)
 
@@ -173,11 +173,11 @@ def _check_sizes(path: str, policy: PreTrainedConfig, available: Mapping[str, Po
             raise MemobenchError(
                 f"the policy {path} was trained on {name} of {seen} pixels and does not resize it, and the environment "
                 f"has {here}; set env.observation_height={height} and env.observation_width={width}, or train it on "
-                f"pictures of that size{also}"
+                f"images of that size{also}"
             )
 
 
-# --- the convention of pictures ---
+# --- the convention of images ---
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
@@ -206,11 +206,11 @@ def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
 def chosen_convention(
     path: str | None, policy: Any, requested: str | None, rename_map: Mapping[str, str] | None = None
 ) -> str | None:
-    """Return the convention of the pictures for a policy: ``requested``, else that of its training.
+    """Return the convention of the images for a policy: ``requested``, else that of its training.
 
-    None if the policy reads no pictures, or has no checkpoint. Another one than the policy's is refused; so is none
+    None if the policy reads no images, or has no checkpoint. Another one than the policy's is refused; so is none
     where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
-    mirror pictures.
+    mirror images.
     """
     if requested is not None:
         check_choice("convention", requested, [*WRIST])
@@ -225,20 +225,20 @@ def chosen_convention(
     command = f"lerobot eval env=memobench policy={name} convention="
     if own is None and requested is None:
         raise MemobenchError(
-            f"the policy {name} may expect upright pictures or mirrored ones as LIBERO's ({why}); run "
+            f"the policy {name} may expect upright images or mirrored ones as LIBERO's ({why}); run "
             f"`{command}{UPRIGHT}` or `{command}{MIRRORED}`, with lerobot-eval --env.convention="
         )
     mapped = [convention for convention, wrist in WRIST.items() if f"{OBS_IMAGES}.{wrist}" in (rename_map or {})]
     for other in (requested, *mapped):
         if own is not None and other not in (None, own):
-            where = "" if other == requested else " in rename_map, which does not mirror pictures"
+            where = "" if other == requested else " in rename_map, which does not mirror images"
             raise MemobenchError(
-                f"the policy {name} expects pictures of convention={own} ({why}), and found {other}{where}; run "
+                f"the policy {name} expects images of convention={own} ({why}), and found {other}{where}; run "
                 f"`{command}{own}`, or `lerobot-eval --env.type=memobench --policy.path={name} "
                 f"--env.convention={own}`"
             )
     if requested is None and own != UPRIGHT:
-        logger.warning("pictures have convention=%s, as in the training of %s (%s)", own, name, why)
+        logger.warning("images have convention=%s, as in the training of %s (%s)", own, name, why)
     return requested or own
 
 

@@ -209,7 +209,7 @@ class RemotePolicy(UntrainedPolicy):
             client.forget()
 
     def needs_observation(self) -> bool:
-        """Return whether the next observation's pictures are sent to a server."""
+        """Return whether the next observation's images are sent to a server."""
         return any(client.needs_observation() for client in self._clients)
 
     def _add_client(self) -> None:
@@ -302,7 +302,7 @@ class Client:
         shown = observation.convention
         if shown is not None and self._stated in WRIST and self._stated != shown:
             raise MemobenchError(
-                f"the policy server at {self._connection.address} expects pictures of convention={self._stated}, and "
+                f"the policy server at {self._connection.address} expects images of convention={self._stated}, and "
                 f"found {shown}; give convention={self._stated}"
             )
         if self._used:
@@ -312,7 +312,7 @@ class Client:
         self._connection.begin(observation.get(TASK))
 
     def needs_observation(self) -> bool:
-        """Return whether the next observation's pictures are sent. Those of the first execution step always are."""
+        """Return whether the next observation's images are sent. Those of the first execution step always are."""
         if self._rests or self._clock is None:
             return not self._rests
         if self._prompt:
@@ -366,7 +366,7 @@ def read_actions(answer: Mapping[str, Any], config: RemoteConfig, address: str) 
 class EnvObservation:
     """One environment's observation in a batch; values are copied on access.
 
-    ``cameras``: our name of a camera -> name of its picture in the batch, where ``camera_name_mapping`` changes it.
+    ``cameras``: our name of a camera -> name of its image in the batch, where ``camera_name_mapping`` changes it.
     """
 
     batch: Mapping[str, Any]
@@ -380,7 +380,7 @@ class EnvObservation:
 
     @property
     def convention(self) -> str | None:
-        """The convention of the pictures by the name of the wrist camera, None if it is unknown."""
+        """The convention of the images by the name of the wrist camera, None if it is unknown."""
         return next((convention for convention, name in WRIST.items() if f"{OBS_IMAGES}.{name}" in self.batch), None)
 
     @property
@@ -393,8 +393,8 @@ class EnvObservation:
         """Return an observation by our name: an image (H, W, 3) uint8, a vector float32, or the instruction."""
         if name == TASK:
             return str(self.batch[TASK][self.env_index])
-        pictures = [f"{OBS_IMAGES}.{names.get(name, name)}" for names in CONVENTIONS.values()]
-        for key in (self.cameras.get(name, ""), *pictures, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
+        images = [f"{OBS_IMAGES}.{names.get(name, name)}" for names in CONVENTIONS.values()]
+        for key in (self.cameras.get(name, ""), *images, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
             if key in self.batch:
                 value = self.batch[key][self.env_index]
                 return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()

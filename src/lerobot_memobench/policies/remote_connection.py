@@ -405,7 +405,7 @@ class VlaEvalConnection(Connection):
 
 
 def _as_png(value: Any) -> Any:
-    """Encode a picture without loss; other values are unchanged."""
+    """Encode an image without loss; other values are unchanged."""
     if not (isinstance(value, np.ndarray) and value.ndim == 3):
         return value
     import cv2

@@ -51,7 +51,7 @@ OBJECT_BATCH = 10
 episode took 3.8 ms, against 6.1 ms with one environment."""
 VIDEO_EPISODES = 10
 """Episodes of each task that are recorded as videos, as many as LeRobot renders; none where only objects are observed,
-without pictures."""
+without images."""
 EVALUATED = (PAPER, VALIDATION, SEALED)
 """Splits that ``split=`` names."""
 

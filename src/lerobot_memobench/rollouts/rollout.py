@@ -1,7 +1,7 @@
 """Roll out a policy in a batch of environments, one episode per row.
 
 The loop is LeRobot's: observation, processors, ``select_action``, processors, step. It skips unneeded work: it queues
-the plans of LeRobot's policies, draws pictures only where the policy reads them, and runs the processors of
+the plans of LeRobot's policies, draws images only where the policy reads them, and runs the processors of
 observations only where the next action is not planned. LeRobot seeds once per run; here the caller seeds each batch, so
 that an evaluation that is resumed or shared among machines draws the same numbers as an undisturbed one.
 """
@@ -45,7 +45,7 @@ class ActionQueue:
 
     A plan of LeRobot's policies in `CHUNKED` is queued here, so that no observation is needed until the queue is empty;
     any other policy selects each action by itself. It may define ``needs_observation``: whether, after an action, it
-    reads the next pictures or objects; and ``has_planned_action``: whether its next ``select_action`` reads only
+    reads the next images or objects; and ``has_planned_action``: whether its next ``select_action`` reads only
     ``observation.phase`` and ``observation.step``.
     """
 
@@ -71,7 +71,7 @@ class ActionQueue:
             return self._queue.popleft()
 
     def needs_observation(self) -> bool:
-        """Return after an action whether the policy reads the next pictures or objects."""
+        """Return after an action whether the policy reads the next images or objects."""
         own = getattr(self._policy, "needs_observation", None)
         return not self.has_planned_action() if own is None else bool(own())
 
@@ -159,7 +159,7 @@ class Inputs:
     def __init__(self, env: Any, actor: Actor) -> None:
         self._env, self._actor = env, actor
         self._drawn, self._planned = True, False  # after the environment's reset
-        self._pictures: dict[str, torch.Tensor] = {}
+        self._images: dict[str, torch.Tensor] = {}
         self._last: dict[str, Any] = {}
         self._phase: NDArray[np.float32] | None = None
 
@@ -175,7 +175,7 @@ class Inputs:
         """Return the policy's inputs; ``drawn``: the environment drew this frame without being asked.
 
         Where its next action is planned, they are the previous inputs with the present clock. Where it reads no
-        pictures, they contain the previous pictures.
+        images, they contain the previous images.
         """
         begins = drawn or self._phase is None or bool((observation[PHASE] != self._phase).any())
         self._phase = np.array(observation[PHASE])
@@ -188,10 +188,10 @@ class Inputs:
             return {**self._last, **now}
         if begins or self._drawn:  # the first frame of an execution is always drawn: a policy cannot foresee it
             converted = preprocess_observation(observation)
-            self._pictures = {key: value for key, value in converted.items() if key.startswith(OBS_IMAGES)}
+            self._images = {key: value for key, value in converted.items() if key.startswith(OBS_IMAGES)}
         else:
             converted = preprocess_observation({key: value for key, value in observation.items() if key != PIXELS})
-            converted = {**self._pictures, **converted}
+            converted = {**self._images, **converted}
         converted["task"] = list(self._env.call("task_description"))
         self._last = self._actor.inputs(converted)
         return self._last

@@ -71,7 +71,7 @@ from lerobot_memobench.policies.memobench_mem.texts import (
     texts_of,
 )
 from lerobot_memobench.sim.convention import convention_of
-from lerobot_memobench.training.features import detected_slots, picture_features
+from lerobot_memobench.training.features import detected_slots, visual_features
 from lerobot_memobench.training.sampler import seed_of
 
 logger = logging.getLogger(__name__)
@@ -168,7 +168,7 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, config: Any) 
 
 def with_features(policy: Any, features: dict[str, Any]) -> Any:
     """Return a policy's configuration with a dataset's features, as LeRobot sets them; given inputs stay."""
-    unused = None if getattr(policy, "uses_pictures", True) else FeatureType.VISUAL
+    unused = None if getattr(policy, "uses_images", True) else FeatureType.VISUAL
     known = dataset_to_policy_features(features)
     config = copy.copy(policy)
     config.output_features = {key: feature for key, feature in known.items() if feature.type is FeatureType.ACTION}
@@ -179,7 +179,7 @@ def with_features(policy: Any, features: dict[str, Any]) -> Any:
 
 
 def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str, Any]) -> None:
-    """Refuse pictures of another convention than a continued checkpoint's, and evaluations on other pictures.
+    """Refuse images of another convention than a continued checkpoint's, and evaluations on other images.
 
     The environment of evaluations during a training receives the plans of the policy, on which holds depend.
     """
@@ -190,14 +190,14 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
         trained, why = trained_convention(str(policy.pretrained_path), policy)
         if trained not in (None, stated):
             raise MemobenchError(
-                f"the policy {policy.pretrained_path} was trained on pictures of convention={trained} ({why}), and "
+                f"the policy {policy.pretrained_path} was trained on images of convention={trained} ({why}), and "
                 f"{meta.root} has convention={stated}; mirror them: `memobench view {meta.root} --convention {trained} "
                 "--out <folder>`"
             )
     if not isinstance(env, MemobenchEnvConfig):
         return
     if stated not in (None, env.convention) and env.obs_type != OBJECTS:
-        raise MemobenchError(f"{meta.root} has pictures of convention={stated}; set env.convention={stated}")
+        raise MemobenchError(f"{meta.root} has images of convention={stated}; set env.convention={stated}")
     if policy.type == "xvla":
         raise MemobenchError(
             "LeRobot's trainer evaluates every XVLA with the processors of LIBERO; leave env out, and evaluate its "
@@ -222,12 +222,12 @@ def open_lookup(
     if isinstance(encoder, ImageTowerEncoder):
         table = read_frame_table(root)
     else:
-        names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_pictures else RECORDED
+        names = [name for name in RECORDED if name != OBS_ENV_STATE] if config.uses_images else RECORDED
         columns, table = read_recorded(root, names)
         logger.info("%d frames of %s are read into memory", table.episodes[-1], root)
     table = with_targets(table, config, root)
     if isinstance(encoder, ImageTowerEncoder | VisualTokenEncoder):
-        memory, present = picture_features(root, config, encoder, in_data)
+        memory, present = visual_features(root, config, encoder, in_data)
         encoded = {encoded_key(camera): features.of_frames for camera, features in present.items()}
         remember = None if memory is None else memory.tokens
     else:
@@ -329,7 +329,7 @@ def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> F
 
 
 class DecodedSamples(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their global indices, pictures included; actions of a chunk after a hold are padding.
+    """LeRobot's samples by their global indices, images included; actions of a chunk after a hold are padding.
 
     With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
     """

@@ -1,6 +1,6 @@
 """Cache the outputs of frozen encoders for every frame of a dataset: one safetensors file per episode.
 
-A memory reads up to 32 earlier frames per sample, and a policy with a frozen encoder needs the tokens of its pictures
+A memory reads up to 32 earlier frames per sample, and a policy with a frozen encoder needs the tokens of its images
 at every update. They are computed once, before training, in ``feature_cache/<name>/`` in the dataset's folder. The name
 ends with a hash of frames, encoder weights, camera and stride, so other inputs have another cache. A file that exists
 is complete. With several processes, each one encodes a part of the episodes.
@@ -47,7 +47,7 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
 from lerobot_memobench.policies.memobench_mem.losses import rank_of_world
 from lerobot_memobench.policies.memobench_mem.memory import NONE
 from lerobot_memobench.policies.memobench_mem.network import make_backbone
-from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromPictures
+from lerobot_memobench.policies.memobench_mem.objects import VIEWS, ObjectsFromImages
 from lerobot_memobench.sim.convention import MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_layout import SIZE
 
@@ -209,14 +209,14 @@ def cameras_of(features: Mapping[str, Any]) -> list[str]:
 # -- features of each kind of policy -----------------------------------------------------------------------------------
 
 
-def picture_features(
+def visual_features(
     root: Path,
     config: MemobenchMemConfig,
     encoder: ImageTowerEncoder | VisualTokenEncoder,
     in_data: Mapping[str, str],
     **how: Any,
 ) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
-    """Make the features of the memory, None without one, and a visual encoder's tokens of present pictures.
+    """Make the features of the memory, None without one, and a visual encoder's tokens of present images.
 
     Pooled tokens are computed from the present ones, so that no video is decoded twice.
 
@@ -247,7 +247,7 @@ def picture_features(
 
 
 def detected_slots(
-    root: Path, detect: ObjectsFromPictures, cameras: dict[str, str], state: str, **how: Any
+    root: Path, detect: ObjectsFromImages, cameras: dict[str, str], state: str, **how: Any
 ) -> EpisodeFeatures:
     """Make a detector's object slots for every frame.
 
@@ -257,7 +257,7 @@ def detected_slots(
         cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
     """
     if convention_of(read_info(root)["features"]) == MIRRORED:
-        raise MemobenchError(f"{root} has pictures of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
+        raise MemobenchError(f"{root} has images of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
     readers = {name: frame_reader(root, of) for name, of in cameras.items()}
     recorded = functools.cache(lambda: read_recorded(root, [state]))  # not needed if the features are complete
 
@@ -326,7 +326,7 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
     """
     config.memory_camera = config.memory_camera or next(iter(cameras_of(read_info(root)["features"])), None)
     if config.detector is not None:
-        detect = ObjectsFromPictures(load_detector(config.detector))
+        detect = ObjectsFromImages(load_detector(config.detector))
         return detected_slots(root, detect, {name: name for name in VIEWS}, OBS_STATE, **how).folder
     if config.uses_objects:
         raise MemobenchError(
@@ -334,5 +334,5 @@ def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path
             "this command, or name a detector"
         )
     load = load_token_encoder if config.uses_visual_encoder else load_image_tower
-    memory, present = picture_features(root, config, load(config, weights), {}, **how)
+    memory, present = visual_features(root, config, load(config, weights), {}, **how)
     return (memory or next(iter(present.values()))).folder

@@ -154,10 +154,10 @@ class TrainingState:
 
     def preprocessed(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Return the model's inputs of a batch of samples."""
-        pictures = [
+        images = [
             key for key in self.training.dataset.meta.camera_keys if key in batch and batch[key].dtype == torch.uint8
         ]
-        batch |= {key: batch[key].to(torch.float32) / 255.0 for key in pictures}
+        batch |= {key: batch[key].to(torch.float32) / 255.0 for key in images}
         inputs: dict[str, Any] = self.training.processors[0](batch)
         return inputs
 

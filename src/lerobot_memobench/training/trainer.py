@@ -1,7 +1,7 @@
 """LeRobot's own trainer, for other policies: the view of a dataset that it reads, its process, and its samples.
 
 ``python -m`` runs the process. LeRobot decodes all videos of a sample, and reads a table for each time of each column
-of a history. For policies without pictures, samples come from main memory: numbers are tensors, pictures are left out;
+of a history. For policies without images, samples come from main memory: numbers are tensors, images are left out;
 all else of a sample is bit-identical to LeRobot's.
 """
 
@@ -56,7 +56,7 @@ def prepare(
 
     Args:
         prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
-        obs_type: kind of observation; None: pictures if the dataset has them, else objects.
+        obs_type: kind of observation; None: images if the dataset has them, else objects.
 
     Raises:
         MemobenchError: the dataset lacks the observations, or is streamed from the hub.
@@ -78,7 +78,7 @@ def prepare(
     if other and has_benchmark_columns(meta.features) and keeps_sizes(policy):
         height, width = sizes[0]
         notify(
-            f"note: {meta.root} has pictures of {height} x {width} pixels, and policy={policy.type} does not resize "
+            f"note: {meta.root} has images of {height} x {width} pixels, and policy={policy.type} does not resize "
             f"them; evaluate it with observation_height={height} observation_width={width}"
         )
     changed = needs_view(meta.features, options)
@@ -161,7 +161,7 @@ def main() -> None:
 
 
 def open_trainer_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
-    """Open LeRobot's datasets of a training and of its held-out episodes; keep them in memory without pictures.
+    """Open LeRobot's datasets of a training and of its held-out episodes; keep them in memory without images.
 
     LeRobot opens environments without the policy, so those of the benchmark receive its plans here.
     """
@@ -169,9 +169,9 @@ def open_trainer_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
         config.env.declare_plans(config.policy)
     datasets: tuple[Any, Any] = make_train_eval_datasets(config)
     inputs = getattr(config.policy, "input_features", None) or {}
-    pictures = [name for name, feature in inputs.items() if feature.type is FeatureType.VISUAL]
-    reads_pictures = bool(pictures if inputs else datasets[0].meta.camera_keys)
-    if config.policy is not None and not config.dataset.streaming and not reads_pictures:
+    images = [name for name, feature in inputs.items() if feature.type is FeatureType.VISUAL]
+    reads_images = bool(images if inputs else datasets[0].meta.camera_keys)
+    if config.policy is not None and not config.dataset.streaming and not reads_images:
         for dataset in datasets:
             if dataset is not None:
                 keep_in_memory(dataset)
@@ -181,7 +181,7 @@ def open_trainer_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
 
 
 def keep_in_memory(dataset: Any) -> None:
-    """Let an opened dataset return its samples from main memory, without pictures."""
+    """Let an opened dataset return its samples from main memory, without images."""
     reader: Any = dataset.reader
     names = [name for name in reader.hf_dataset.column_names if name not in dataset.meta.camera_keys]
     table = reader.hf_dataset.select_columns(names)

@@ -1,9 +1,9 @@
 """Write a view of a dataset for LeRobot's trainer: without prompt and held frames, and with columns of chosen inputs.
 
 LeRobot trains on all frames, including those of demonstration prompts and holds, in which actions have no effect. It
-uses every column that begins with ``observation`` as an input: pictures, object state, phase and step. A view is a
+uses every column that begins with ``observation`` as an input: images, object state, phase and step. A view is a
 LeRobotDataset v3.0 with a part of the frames and columns; its videos are links to the dataset's, or mirrored copies for
-another convention of pictures. Each part of an episode between two holds is an episode of the view, so that chunks of
+another convention of images. Each part of an episode between two holds is an episode of the view, so that chunks of
 actions and windows of inputs end at a hold.
 """
 
@@ -61,7 +61,7 @@ class ViewOptions:
     Attributes:
         prompts: whether the view has the frames of demonstration prompts and holds, and the clock.
         obs_type: `envs.observations.OBS_TYPES`; None: all observations.
-        convention: of the pictures (`sim.convention`); None: the dataset's.
+        convention: of the images (`sim.convention`); None: the dataset's.
     """
 
     prompts: bool = False
@@ -74,7 +74,7 @@ class ViewOptions:
         objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
         dropped = set() if self.prompts else {*CLOCK}
         if (self.obs_type in (OBJECTS, BOTH) and not objects) or (self.obs_type in (PIXELS, BOTH) and not cameras):
-            inputs = ", ".join(cameras + objects) or "neither pictures nor objects"
+            inputs = ", ".join(cameras + objects) or "neither images nor objects"
             raise MemobenchError(
                 f"found obs_type={self.obs_type}, and the dataset has {inputs}; choose another obs_type, or generate a "
                 "dataset that has it"
@@ -90,12 +90,12 @@ class ViewOptions:
         return {name: renamed.get(name, name) for name in features if name not in dropped}
 
     def mirrors(self, features: Mapping[str, Any]) -> bool:
-        """Return whether the view mirrors pictures left to right; refuse a view without, or an unknown convention."""
+        """Return whether the view mirrors images left to right; refuse a view without, or an unknown convention."""
         if self.convention is None:
             return False
         cameras, convention = cameras_of(features), convention_of(features)
         if not cameras or self.obs_type == OBJECTS:
-            raise MemobenchError(f"found convention={self.convention}, and the view has no pictures; leave it out")
+            raise MemobenchError(f"found convention={self.convention}, and the view has no images; leave it out")
         if convention is None:
             raise MemobenchError(
                 f"found convention={self.convention}, and it is unknown whether {', '.join(cameras)} are upright or "
@@ -113,14 +113,14 @@ def view_options(
     if chooses_inputs(policy):
         return ViewOptions(prompts, None)
     if begun:
-        pictures = any(feature.type is FeatureType.VISUAL for feature in begun.values())
+        images = any(feature.type is FeatureType.VISUAL for feature in begun.values())
         objects = OBJECTS_COLUMN in begun
     elif obs_type is not None:
         return ViewOptions(prompts, obs_type)
     else:
-        pictures = bool(cameras_of(features))
-        objects = not pictures and (PRIVILEGED in features or OBJECTS_COLUMN in features)
-    seen = {(True, True): BOTH, (True, False): PIXELS, (False, True): OBJECTS}.get((pictures, objects))
+        images = bool(cameras_of(features))
+        objects = not images and (PRIVILEGED in features or OBJECTS_COLUMN in features)
+    seen = {(True, True): BOTH, (True, False): PIXELS, (False, True): OBJECTS}.get((images, objects))
     return ViewOptions(prompts, seen)
 
 

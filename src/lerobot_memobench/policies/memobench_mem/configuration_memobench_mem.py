@@ -74,7 +74,7 @@ class Condition(NamedTuple):
 
 
 OBJECTS = Condition("perception=objects", lambda config: config.uses_objects)
-PICTURES = Condition("a policy that sees pictures", lambda config: config.uses_pictures)
+IMAGES = Condition("a policy that sees images", lambda config: config.uses_images)
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda config: config.uses_visual_encoder)
 STATE_TOKEN = Condition("a policy whose state is a token", lambda config: config.state_token)
 MEMORY = Condition("a memory", lambda config: config.memory != NONE)
@@ -177,10 +177,10 @@ class MemobenchMemConfig(PreTrainedConfig):
     """Source of observation tokens: ``pixels``, encoded by a frozen network, or ``objects``, the slots of
     ``observation.environment_state`` (`sim.object_slots`): privileged object state, or detections."""
     detector: str | None = policy_setting(None, used_if=OBJECTS)
-    """With ``perception=objects``: detect objects in pictures by this detector, instead of reading privileged object
+    """With ``perception=objects``: detect objects in images by this detector, instead of reading privileged object
     state. ``package``, or a file of `python -m research.detector train`. A checkpoint holds only its name."""
     visual_encoder: str | None = policy_setting(None, used_if=VISUAL_ENCODER)
-    """With pixels at ``size=small``: the frozen encoder of pictures, of ``package`` (the default) or of a detector's
+    """With pixels at ``size=small``: the frozen encoder of images, of ``package`` (the default) or of a detector's
     file. A checkpoint holds its weights."""
     detection_noise: float = policy_setting(0.0, used_if=OBJECTS, least=0)
     """Size of the errors added to privileged object state in training, so that the policy later acts by a
@@ -243,8 +243,8 @@ class MemobenchMemConfig(PreTrainedConfig):
     oracle_memory: bool = False
     """Control of the paper: ground-truth memory text in the prompt, from the dataset's column ``memory`` in training
     and from the environment (``--env.oracle_memory=true``) in evaluation."""
-    memory_camera: str | None = policy_setting(None, used_if=PICTURES)
-    """Camera whose pictures are remembered; None: the first of the policy's."""
+    memory_camera: str | None = policy_setting(None, used_if=IMAGES)
+    """Camera whose images are remembered; None: the first of the policy's."""
     memory_stride: int = policy_setting(FROM_SIZE, used_if=MEMORY, least=1)
     """Control steps between remembered frames; None: the mechanism's, or 8 if training decodes no video (objects, or
     pixels through a visual encoder), else 1."""
@@ -446,17 +446,17 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def uses_detector(self) -> bool:
-        """Whether objects are detected in pictures."""
+        """Whether objects are detected in images."""
         return self.detector is not None
 
     @property
     def uses_visual_encoder(self) -> bool:
-        """Whether pictures are encoded by the visual encoder of `lerobot_memobench.perception`."""
+        """Whether images are encoded by the visual encoder of `lerobot_memobench.perception`."""
         return self.size == "small" and not self.uses_objects
 
     @property
-    def uses_pictures(self) -> bool:
-        """Whether pictures are read."""
+    def uses_images(self) -> bool:
+        """Whether images are read."""
         return self.uses_detector or not self.uses_objects
 
     @property
@@ -478,7 +478,7 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Height and width to which pictures are resized, pixels."""
+        """Height and width to which images are resized, pixels."""
         side = SIDE if self.uses_visual_encoder else self.dimensions.vision.image
         return side, side
 
@@ -494,7 +494,7 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def remembers_thumbnails(self) -> bool:
-        """Whether small grey copies of pictures are remembered instead of their tokens."""
+        """Whether small grey copies of images are remembered instead of their tokens."""
         return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
 
     @property
@@ -539,14 +539,14 @@ class MemobenchMemConfig(PreTrainedConfig):
     observation_delta_indices = reward_delta_indices = None
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Add the objects of a dataset with pictures to the inputs; LeRobot does not recognise their column."""
-        if not self.uses_pictures and PRIVILEGED in features:
+        """Add the objects of a dataset with images to the inputs; LeRobot does not recognise their column."""
+        if not self.uses_images and PRIVILEGED in features:
             shape = tuple(features[PRIVILEGED]["shape"])
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
 
     def validate_features(self) -> None:
         """Remove features that this perception does not read; with a detector, add its cameras."""
-        unseen = FeatureType.ENV if self.uses_pictures else FeatureType.VISUAL
+        unseen = FeatureType.ENV if self.uses_images else FeatureType.VISUAL
         for key in [key for key, feature in self.input_features.items() if feature.type is unseen or key in CLOCK]:
             del self.input_features[key]
         if self.uses_detector and not self.image_features:
@@ -554,7 +554,7 @@ class MemobenchMemConfig(PreTrainedConfig):
             self.input_features |= {
                 f"{OBS_IMAGES}.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name in CAMERAS
             }
-        if not self.uses_pictures and OBS_ENV_STATE not in self.input_features:
+        if not self.uses_images and OBS_ENV_STATE not in self.input_features:
             raise MemobenchError(
                 f"perception=objects reads '{OBS_ENV_STATE}', which the inputs lack; train on a dataset of this "
                 "version's `memobench generate`, and evaluate with --env.obs_type=environment_state_agent_pos."
@@ -568,7 +568,7 @@ class MemobenchMemConfig(PreTrainedConfig):
         cameras = [*self.image_features]
         if self.memory_camera is None and cameras:
             self.memory_camera = cameras[0]
-        if self.uses_pictures and not self.uses_objects and cameras and self.memory_camera not in cameras:
+        if self.uses_images and not self.uses_objects and cameras and self.memory_camera not in cameras:
             raise MemobenchError(
                 f"--policy.memory_camera={self.memory_camera} is not among the policy's cameras "
                 f"({', '.join(cameras)}); name one of them, or leave it out for the first."

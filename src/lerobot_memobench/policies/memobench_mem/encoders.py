@@ -1,4 +1,4 @@
-"""Encoders of pictures: present pictures to prefix tokens, remembered pictures to the input of a memory."""
+"""Encoders of images: present images to prefix tokens, remembered images to the input of a memory."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class ObservationEncoder(ABC):
         memory_input: name of the observation that is remembered.
         dim: D, width of the memory's input tokens.
         tokens_per_frame: P, number of the memory's input tokens.
-        grid: side of the square of a picture's tokens; 0 if tokens have no place in a picture.
+        grid: side of the square of an image's tokens; 0 if tokens have no place in an image.
     """
 
     memory_input: str
@@ -110,12 +110,12 @@ LUMA = (0.299, 0.587, 0.114)  # of ITU-R BT.601
 
 
 @torch.no_grad()
-def thumbnails(pictures: Tensor) -> Tensor:
-    """Return small grey copies (N, 1, THUMBNAIL^2) of pictures (N, 3, H, W) in [0, 1].
+def thumbnails(images: Tensor) -> Tensor:
+    """Return small grey copies (N, 1, THUMBNAIL^2) of images (N, 3, H, W) in [0, 1].
 
     Values are 0 ... 255, which bfloat16 holds exactly.
     """
-    grey = (pictures.to(torch.float32) * pictures.new_tensor(LUMA, dtype=torch.float32)[:, None, None]).sum(dim=1)
+    grey = (images.to(torch.float32) * images.new_tensor(LUMA, dtype=torch.float32)[:, None, None]).sum(dim=1)
     small = interpolate(grey.unsqueeze(1), (THUMBNAIL, THUMBNAIL), mode="area")
     return (255 * small).round().clamp(0, 255).flatten(2).to(torch.bfloat16)
 
@@ -127,7 +127,7 @@ class ImageTowerEncoder(ObservationEncoder):
     """pi0.5's frozen image tower, and the projection of its tokens to the language model's width.
 
     Args:
-        resolution: height and width of the tower's pictures, pixels. camera: the remembered one.
+        resolution: height and width of the tower's images, pixels. camera: the remembered one.
         cameras: of the present. thumbnails: remember small grey copies instead of tokens.
     """
 
@@ -154,22 +154,22 @@ class ImageTowerEncoder(ObservationEncoder):
         return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the tokens (n, 16, D) of some rows' pictures, or thumbnails."""
-        pictures = batch[self.memory_input][list(rows)]
-        return thumbnails(pictures) if self.thumbnails else self(pictures)
+        """Return the tokens (n, 16, D) of some rows' images, or thumbnails."""
+        images = batch[self.memory_input][list(rows)]
+        return thumbnails(images) if self.thumbnails else self(images)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return the tower's pictures of all cameras; black ones, masked, for cameras that the batch lacks."""
-        pictures = [self._resized(batch[camera]) for camera in self.cameras if camera in batch]
-        if not pictures:
-            raise MemobenchError(f"The observation has no picture; {hint('picture', batch)}")
-        missing = len(self.cameras) - len(pictures)
-        rows, blank = len(pictures[0]), torch.full_like(pictures[0], -1.0)
-        masks = [torch.full((rows,), real) for real in [True] * len(pictures) + [False] * missing]
-        return [*pictures, *[blank] * missing], masks
+        """Return the tower's images of all cameras; black ones, masked, for cameras that the batch lacks."""
+        images = [self._resized(batch[camera]) for camera in self.cameras if camera in batch]
+        if not images:
+            raise MemobenchError(f"The observation has no image; {hint('image', batch)}")
+        missing = len(self.cameras) - len(images)
+        rows, blank = len(images[0]), torch.full_like(images[0], -1.0)
+        masks = [torch.full((rows,), real) for real in [True] * len(images) + [False] * missing]
+        return [*images, *[blank] * missing], masks
 
     def _resized(self, images: Tensor) -> Tensor:
-        """Return pictures (N, 3, H, W) in [0, 1] as those of the tower, in [-1, 1]."""
+        """Return images (N, 3, H, W) in [0, 1] as those of the tower, in [-1, 1]."""
         images = images.to(next(self.tower.parameters()).device, torch.float32)
         if tuple(images.shape[-2:]) != tuple(self.resolution):
             images = resize_with_pad_torch(images, *self.resolution)
@@ -177,7 +177,7 @@ class ImageTowerEncoder(ObservationEncoder):
 
     @torch.no_grad()
     def __call__(self, images: Tensor) -> Tensor:
-        """Encode pictures (N, 3, H, W) float in [0, 1] to (N, 16, D) bfloat16 on the tower's device."""
+        """Encode images (N, 3, H, W) float in [0, 1] to (N, 16, D) bfloat16 on the tower's device."""
         images = self._resized(images)
         # With mixed precision, tokens of a rollout would differ from cached tokens.
         with torch.autocast(images.device.type, enabled=False):
@@ -187,7 +187,7 @@ class ImageTowerEncoder(ObservationEncoder):
         return pooled.to(torch.bfloat16)
 
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return all patch tokens (B, g*g, D) of pictures (B, 3, H, W) in [-1, 1], in the pictures' precision.
+        """Return all patch tokens (B, g*g, D) of images (B, 3, H, W) in [-1, 1], in the images' precision.
 
         The tower always computes in float32.
         """
@@ -198,16 +198,16 @@ class ImageTowerEncoder(ObservationEncoder):
 
 
 ENCODED = "observation.encoded."
-"""Prefix of the names of encoded pictures in training samples."""
+"""Prefix of the names of encoded images in training samples."""
 
 
 def encoded_key(camera: str) -> str:
-    """Return the name in a training sample of the tokens (B, 64, WIDTH) of a camera's picture."""
+    """Return the name in a training sample of the tokens (B, 64, WIDTH) of a camera's image."""
     return ENCODED + camera.removeprefix(f"{OBS_IMAGES}.")
 
 
 class PixelPool(nn.Module):
-    """Project the pooled tokens of a remembered picture to the policy's width, at unit size as in `ObjectPool`."""
+    """Project the pooled tokens of a remembered image to the policy's width, at unit size as in `ObjectPool`."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -220,7 +220,7 @@ class PixelPool(nn.Module):
 
 
 class VisualTokenEncoder(nn.Module, ObservationEncoder):
-    """Encode the present pictures of all cameras by the frozen visual encoder; remember pooled tokens of one camera.
+    """Encode the present images of all cameras by the frozen visual encoder; remember pooled tokens of one camera.
 
     Args:
         tower: folded; registered as a part of the model and not here.
@@ -251,20 +251,20 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
 
     @property
     def key(self) -> str:
-        """Identity of the pooled tokens: weights, and size of the pictures."""
+        """Identity of the pooled tokens: weights, and size of the images."""
         return f"{self._weights}-tokens{self.tokens_per_frame}"
 
     @property
     def present_key(self) -> str:
-        """Identity of the tokens of present pictures."""
+        """Identity of the tokens of present images."""
         return f"{self._weights}-tokens{GRID**2}"
 
     @torch.no_grad()
-    def encode(self, pictures: Tensor) -> Tensor:
-        """Return the tokens (N, 64, WIDTH) bfloat16 of pictures (N, 3, H, W) in [0, 1]."""
+    def encode(self, images: Tensor) -> Tensor:
+        """Return the tokens (N, 64, WIDTH) bfloat16 of images (N, 3, H, W) in [0, 1]."""
         device = self.tower.grid_position.device
         with torch.autocast(device.type, enabled=False):  # mixed precision would differ from the cache
-            tokens: Tensor = self.tower(area_averaged(pictures.to(device)))
+            tokens: Tensor = self.tower(area_averaged(images.to(device)))
         return tokens.to(torch.bfloat16)
 
     @torch.no_grad()
@@ -275,7 +275,7 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
             return tower.pooled(tokens.to(tower.grid_position.device, torch.float32)).to(torch.bfloat16)
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its pictures."""
+        """Return each camera's tokens (B, 64, WIDTH): those in the batch, or encoded from its images."""
         parts = [self._tokens(batch, camera) for camera in self.cameras]
         return parts, [torch.ones(len(part), dtype=torch.bool) for part in parts]
 

@@ -320,7 +320,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         """Add the present frames of all environments to their histories."""
         name = self.perception.memory_input
         if name not in batch:
-            what = f"'{name}'" if name else "picture"
+            what = f"'{name}'" if name else "image"
             raise MemobenchError(f"the observation has no {what}, which this policy remembers; {hint(name, batch)}")
         steps = _column(batch, OBS_STEP)
         phases = None if steps is None else _column(batch, OBS_PHASE)
@@ -403,7 +403,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         return torch.stack([torch.randn(shape) if training else self.rollout.envs[row].noise(shape) for row in rows])
 
     def needs_observation(self) -> bool:
-        """Return after an action whether the next observation's pictures or objects are read, for memory or a plan.
+        """Return after an action whether the next observation's images or objects are read, for memory or a plan.
 
         The first frames of an episode and of its execution, which only the environment can foresee, are always read.
         """

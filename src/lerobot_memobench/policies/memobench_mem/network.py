@@ -49,7 +49,7 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
 )
 from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
-from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromPictures
+from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromImages
 from lerobot_memobench.policies.memobench_mem.sizes import Dimensions
 from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from lerobot_memobench.sim.object_slots import classes
@@ -69,7 +69,7 @@ class Observation(NamedTuple):
     """Inputs of a pass.
 
     Attributes:
-        images: pictures or tokens of each part of the observation; in a model with a state token, the last is the
+        images: images or tokens of each part of the observation; in a model with a state token, the last is the
             state (B, dim). image_masks: (B,) or (B, n) bool of each part, False if it is missing.
         words: (B, n) token numbers of the instruction. word_masks: (B, n) bool, False for padding.
     """
@@ -416,7 +416,7 @@ def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
     config.object_classes = config.object_classes or list(classes())
     if config.detector is not None:
         # Detection noise applies to privileged object state only.
-        detect = ObjectsFromPictures(load_detector(config.detector))
+        detect = ObjectsFromImages(load_detector(config.detector))
         return DetectionEncoder(detect, config.object_classes, width, config.memory_phase)
     return ObjectEncoder(config.object_classes, width, config.detection_noise, config.memory_phase)
 

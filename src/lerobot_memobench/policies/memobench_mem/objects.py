@@ -220,49 +220,47 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
 DETECTED = f"{ENCODED}objects"
 """Key of the detections (B, SIZE) in a training sample."""
 VIEWS = {f"{OBS_IMAGES}.{name}": camera for name, camera in CAMERAS.items()}
-"""Key of a picture at the policy -> camera."""
+"""Key of an image at the policy -> camera."""
 
 
-class ObjectsFromPictures:
-    """Detect objects in pictures, and return them as slots."""
+class ObjectsFromImages:
+    """Detect objects in images, and return them as slots."""
 
     def __init__(self, detector: Detector) -> None:
         self._detector, self._locate = detector, ObjectLocalizer(detector)
 
     @cached_property
     def key(self) -> str:
-        """Identity of the detections: weights, and size of the pictures."""
+        """Identity of the detections: weights, and size of the images."""
         return f"{fingerprint({'detector': self._detector})}-{SIDE}x{SIDE}-objects-{SIZE}"
 
-    def __call__(self, pictures: Mapping[str, Tensor], states: Tensor) -> Tensor:
-        """Return the slots (N, SIZE) float32 of pictures (N, 3, H, H) in [0, 1] and robots' states (N, >= 6)."""
+    def __call__(self, images: Mapping[str, Tensor], states: Tensor) -> Tensor:
+        """Return the slots (N, SIZE) float32 of images (N, 3, H, H) in [0, 1] and robots' states (N, >= 6)."""
         for name in VIEWS:
-            if name not in pictures:
-                raise MemobenchError(
-                    f"The observation has no '{name}', which the detector reads; {hint(name, pictures)}"
-                )
+            if name not in images:
+                raise MemobenchError(f"The observation has no '{name}', which the detector reads; {hint(name, images)}")
         device = next(self._detector.parameters()).device
-        views = {camera: pictures[name].to(device) for name, camera in VIEWS.items()}
+        views = {camera: images[name].to(device) for name, camera in VIEWS.items()}
         with torch.autocast(device.type, enabled=False):  # mixed precision would differ from training
             return self._locate(views, states).to(states.device)
 
 
 class DetectionEncoder(ObjectEncoder):
-    """A token per object detected in the present pictures, instead of privileged object state.
+    """A token per object detected in the present images, instead of privileged object state.
 
     The trained layers are those of `ObjectEncoder`, so a policy trained on privileged object state also acts from
-    pictures. The detector (``detect``) is no module, so that a checkpoint holds only its name.
+    images. The detector (``detect``) is no module, so that a checkpoint holds only its name.
     """
 
     memory_input = next(iter(VIEWS))
 
-    def __init__(self, detect: ObjectsFromPictures, trained: Sequence[str], width: int, phase: bool = False) -> None:
+    def __init__(self, detect: ObjectsFromImages, trained: Sequence[str], width: int, phase: bool = False) -> None:
         super().__init__(trained, width, phase=phase)
         self.detect = detect
         self.key = detect.key
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return the slots of detections in the batch or in its pictures."""
+        """Return the slots of detections in the batch or in its images."""
         return super().present(self._with_objects(batch))
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
@@ -279,7 +277,7 @@ class DetectionEncoder(ObjectEncoder):
 # -- detection noise ---------------------------------------------------------------------------------------------------
 
 # Errors like the detector's, added to privileged object state and drawn for every batch. With them, a policy learns
-# from demonstrations without pictures to act by detections. The sizes are those of the package's detector on 720 frames
+# from demonstrations without images to act by detections. The sizes are those of the package's detector on 720 frames
 # of the scenes that version 0.2 modelled in code (tuning seeds, arms moved at random): an error of 1.6 mm in the
 # median, 8 mm at the 90th percentile and 18 mm at the 97th.
 

@@ -193,7 +193,7 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         transition = transition.copy()
         transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(lookup, indices)}
         observation = transition.get(TransitionKey.OBSERVATION) or {}
-        # In a dataset with pictures the column of objects is no observation of LeRobot's.
+        # In a dataset with images the column of objects is no observation of LeRobot's.
         if OBS_ENV_STATE in lookup.columns and OBS_ENV_STATE not in observation:
             transition[TransitionKey.OBSERVATION] = {
                 **observation,

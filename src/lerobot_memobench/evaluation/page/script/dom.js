@@ -119,7 +119,7 @@ function checkpointText(task, variant, index, level) {
   return checkpointTexts(task, variant, index)?.[DATA.levels.indexOf(level)] ?? `checkpoint ${index + 1}`;
 }
 
-/** One tooltip for everything that has `data-tip`, on hover and on keyboard focus; a `picture()` of its owner is above
+/** One tooltip for everything that has `data-tip`, on hover and on keyboard focus; a `image()` of its owner is above
     the words. */
 function enableTips() {
   const tip = byId("tip");
@@ -127,7 +127,7 @@ function enableTips() {
     const owner = event.target.closest?.("[data-tip]");
     tip.hidden = !owner;
     if (!owner) return;
-    tip.replaceChildren(owner.picture?.() ?? "", owner.dataset.tip);
+    tip.replaceChildren(owner.image?.() ?? "", owner.dataset.tip);
     const box = owner.getBoundingClientRect();
     const x = event.type === "focusin" ? box.left + box.width / 2 : event.clientX;
     const left = Math.min(Math.max(8, x - tip.offsetWidth / 2), innerWidth - tip.offsetWidth - 8);

@@ -63,11 +63,11 @@ function heatCell(episode, cell, most, draw, seek) {
     "aria-label": tip.replaceAll("\n", ", "),
     on: { click: () => cell.entry < 0 || seek(cell.entry) },
   });
-  if (episode.video && cell.entry >= 0) button.picture = () => pictureAt(episode, cell.entry);
+  if (episode.video && cell.entry >= 0) button.image = () => imageAt(episode, cell.entry);
   return button;
 }
 
-/** All chunks as one picture, a row each. */
+/** All chunks as one image, a row each. */
 function heatMap(episode, chunks, most, words, draw) {
   const end = lastFrame(episode);
   const map = el("canvas", { width: Math.min(end, 1600), height: chunks.length, role: "img", "aria-label": words, "data-tip": words });
@@ -101,8 +101,8 @@ function walk(event) {
 }
 
 /** A frame of an episode's video, small: the main camera, which is its lower left. */
-function pictureAt(episode, frame) {
-  if (pictureAt.episode !== episode) Object.assign(pictureAt, { episode, video: screenOf(episode).video });
-  pictureAt.video.currentTime = timeOf(frame);
-  return el("span", { class: "picture" }, pictureAt.video);
+function imageAt(episode, frame) {
+  if (imageAt.episode !== episode) Object.assign(imageAt, { episode, video: screenOf(episode).video });
+  imageAt.video.currentTime = timeOf(frame);
+  return el("span", { class: "image" }, imageAt.video);
 }

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 MEMORY_GRID = 4
-"""A remembered picture is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
+"""A remembered image is pooled to MEMORY_GRID x MEMORY_GRID tokens."""
 OBJECT_TOKENS = 2
 """The objects of a remembered frame are pooled to this number of tokens."""
 
@@ -122,7 +122,7 @@ class MemorySpec:
     Attributes:
         dim: D, width of a frame's tokens. tokens: P, their number. width: d_m, of memory tokens.
         expert: width of the action expert.
-        grid: side of the square of a picture's tokens; 0 if tokens have no place in a picture.
+        grid: side of the square of an image's tokens; 0 if tokens have no place in an image.
         stride: control steps between written frames.
         subgoals: texts of the checkpoints; with `MemoryMechanism.privileged`.
     """
@@ -148,7 +148,7 @@ class MemoryMechanism(nn.Module, ABC):
         Settings: a dataclass of the settings (``policy.memory_settings``), each with a default.
         stride: default number of control steps between written frames, or one per perception; None: as `frames`.
         asks_present: whether `read` needs tokens of the present observation.
-        asks_motion: whether the memory stores motion: its pool is a `motion.MotionField`, and a stored picture
+        asks_motion: whether the memory stores motion: its pool is a `motion.MotionField`, and a stored image
             is a thumbnail.
         ahead: number of following frames that training loads as labels.
         privileged: whether it learns from texts of checkpoints. A rollout gets the texts of its task, in no order.
@@ -208,7 +208,7 @@ class MemoryMechanism(nn.Module, ABC):
     def pooled(self, frames: Tensor) -> Tensor:
         """Return the tokens (N, P, D) of stored frames (N, P', D'), at least in the precision of the weights.
 
-        Frames of pictures are stored in bfloat16; weights are float32 in training and usually in a rollout.
+        Frames of images are stored in bfloat16; weights are float32 in training and usually in a rollout.
         """
         tokens: Tensor = self.pool(frames)
         own = next((parameter for name, parameter in self.named_parameters() if not name.startswith("pool.")), tokens)

@@ -3,7 +3,7 @@
 From HiF-VLA (OpenHelix-Team/HiF-VLA, CVPR 2026): hindsight of the last 8 motions, its encoder, 8 foresight queries,
 their loss of 0.01 L1, and modulation of the expert by hindsight. `docs/guides/memory/motion.md` lists the differences.
 
-A motion field has C cells of K numbers. Of pictures a cell is a block of the thumbnail, whose motion is found by
+A motion field has C cells of K numbers. Of images a cell is a block of the thumbnail, whose motion is found by
 exhaustive block matching, as in a video codec; of objects it is a slot, or the hand, whose motion is a displacement.
 
 Shapes: N pairs of frames, B samples, h pairs of a sample, n following frames, W width of tokens.
@@ -114,7 +114,7 @@ class Foresight(MemoryFusion):
 class Motion(MemoryMechanism):
     """The last 8 motions between stored frames, as one token.
 
-    Of objects every control step is stored; of pictures every fourth, in which an arm moves by some pixels of a
+    Of objects every control step is stored; of images every fourth, in which an arm moves by some pixels of a
     thumbnail. With fewer motions the earliest is repeated; at an episode's first frame the motion is zero.
     """
 
@@ -138,7 +138,7 @@ class Motion(MemoryMechanism):
         """Return the motion field for the stored frames of an encoder."""
         if isinstance(observations, ObjectEncoder):
             return ObjectMotion(observations.order, observations.kinds, spec.expert, HINDSIGHT)
-        return PictureMotion(spec.expert, HINDSIGHT)
+        return ImageMotion(spec.expert, HINDSIGHT)
 
     @property
     def field(self) -> MotionField:
@@ -248,7 +248,7 @@ class MotionField(nn.Module, ABC):
         """Return tokens (B, T, W), positions included, of the fields (B, h, C, K) of a sample, oldest first."""
 
 
-# -- pictures ---------------------------------------------------------------------------------------------------------
+# -- images ---------------------------------------------------------------------------------------------------------
 
 
 BLOCKS = 16
@@ -267,9 +267,9 @@ WIDE = 512
 
 @torch.no_grad()
 def match_blocks(before: Tensor, now: Tensor) -> Tensor:
-    """Return the displacement (N, 16, 16, 2) in pixels, x and y, of each block between pictures (N, S, S).
+    """Return the displacement (N, 16, 16, 2) in pixels, x and y, of each block between images (N, S, S).
 
-    The offset within `REACH` with the least sum of absolute differences is chosen; pictures are padded by their edge.
+    The offset within `REACH` with the least sum of absolute differences is chosen; images are padded by their edge.
     """
     moving = F.avg_pool2d((now - before).abs().unsqueeze(1), BLOCK).squeeze(1) > UNCHANGED
     around = F.pad(before.unsqueeze(1), (REACH,) * 4, mode="replicate").squeeze(1)
@@ -287,7 +287,7 @@ def match_blocks(before: Tensor, now: Tensor) -> Tensor:
     return moved
 
 
-class PictureMotion(MotionField):
+class ImageMotion(MotionField):
     """Motion of a thumbnail's blocks, in its pixels, and two convolutions over time and place (HiF-VLA's)."""
 
     size, cells, numbers, moved = THUMBNAIL**2, BLOCKS**2, 2, 2
