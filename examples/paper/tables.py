@@ -24,7 +24,7 @@ from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, WRITERS, Cell, R
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 
 SETTINGS = {
-    **{"suite": PUBLISHED, "protocol": BY_PAPER, "referent": "fixed", "demonstration_prompt": True},
+    **{"suite": PUBLISHED, "rules": BY_PAPER, "referent": "fixed", "demonstration_prompt": True},
     **{"horizon": HORIZON, "seed_base": EVALUATION_SEED, **IMAGE_SETTINGS},
 }
 """Settings of the paper's evaluations."""

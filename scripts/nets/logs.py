@@ -31,7 +31,7 @@ EVALUATIONS = (
     f"{BLIND} tasks=21 referent=random evidence=true episodes=3 horizon=60",
     f"{SHIPPED} tasks=24 episodes=1 interference=1 horizon=60",
     f"{SHIPPED} tasks=24 episodes=1 corrupt=delete horizon=60",
-    f"{RANDOM} protocol=upstream tasks=7 episodes=1 horizon=20",
+    f"{RANDOM} rules=upstream tasks=7 episodes=1 horizon=20",
     f"{BLIND.replace(OBJECTS, 'obs_type=both')} convention=libero observation_height=64 observation_width=64 "
     "robot_state=true tasks=7 episodes=1 horizon=20 videos=1",
 )

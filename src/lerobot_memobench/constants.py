@@ -8,8 +8,8 @@ CONTROL_HZ = 20
 """Control steps, and therefore frames, per second."""
 HORIZON = 1200
 """Maximum number of control steps of an execution."""
-PROTOCOLS = BY_PAPER, UPSTREAM = ("paper", "upstream")
-"""Values of the setting ``protocol``: the evaluation of the paper's text, or of the authors' published script."""
+RULES = BY_PAPER, UPSTREAM = ("paper", "upstream")
+"""Values of the setting ``rules``: the evaluation of the paper's text, or of the authors' published script."""
 UPSTREAM_HORIZON = 990
 """Maximum number of control steps of an execution in the script: LIBERO's limit of 1,000 minus 10 of stabilisation."""
 UPSTREAM_EVALUATIONS = 2

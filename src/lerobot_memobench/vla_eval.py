@@ -234,9 +234,9 @@ class MEMOBench(StepBenchmark):
         return dict.fromkeys(("success", *process), "mean")
 
     def get_metadata(self) -> dict[str, Any]:
-        """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and protocol."""
+        """Return the maximum number of steps (horizon and pauses), suite, source of the scenes, and rules."""
         own = self._settings
-        return {"max_steps": longest(own), "suite": own.suite, WORLD: LIBERO, "protocol": own.protocol}
+        return {"max_steps": longest(own), "suite": own.suite, WORLD: LIBERO, "rules": own.rules}
 
     def get_action_spec(self) -> dict[str, specs.DimSpec]:
         """Return the conventions of an action."""

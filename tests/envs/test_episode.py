@@ -274,11 +274,11 @@ def drawer(goal: Formula, checkpoint: Formula = OPENED) -> Task:
 def test_upstream_evaluates_twice_per_step_and_while_the_scene_settles() -> None:
     three_times = drawer(Then((AT_START, AT_START, AT_START)))
     assert run(three_times, seed=7).exec_steps == 30
-    assert run(three_times, seed=7, protocol="upstream").exec_steps == 15 - 10
+    assert run(three_times, seed=7, rules="upstream").exec_steps == 15 - 10
 
 
 def test_upstream_ends_when_all_checkpoints_have_held() -> None:
-    upstream = run(drawer(OPENED, AT_START), seed=7, protocol="upstream")
+    upstream = run(drawer(OPENED, AT_START), seed=7, rules="upstream")
     assert (upstream.exec_steps, upstream.success, upstream.checkpoints_satisfied) == (1, False, True)
     assert episode_record(upstream, 0, 0.1)["failure"] == "execution_failure"
     paper = run(drawer(OPENED, AT_START), seed=7, horizon=3)
@@ -286,7 +286,7 @@ def test_upstream_ends_when_all_checkpoints_have_held() -> None:
 
 
 def test_upstream_shows_no_prompt() -> None:
-    episode = Episode(get_task(HIGHLIGHT), protocol="upstream")
+    episode = Episode(get_task(HIGHLIGHT), rules="upstream")
     episode.reset(7)
     assert episode.phase == EXECUTION
     line = episode_record(episode, 0, 0.1)

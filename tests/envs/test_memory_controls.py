@@ -155,7 +155,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"interference": 1, "corrupt": "swap"}, "one control"),
     ({"interference": 1, "prompt_in": "reset"}, "reads prompts"),
     ({"reshow": True, "demonstration_prompt": False}, "demonstration_prompt"),
-    ({"protocol": "upstream", "interference": 1}, "upstream"),
+    ({"rules": "upstream", "interference": 1}, "upstream"),
 ]
 
 

@@ -43,7 +43,7 @@ TAKERS: dict[str, Callable[..., object]] = {
 }
 BAD: dict[str, tuple[Any, ...]] = {
     "suite": ("strikt",),
-    "protocol": ("papers",),
+    "rules": ("papers",),
     "seed_base": (-1,),
     "obs_type": ("state",),
     "referent": ("randon", "drawn"),
@@ -93,8 +93,8 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     ("asked", "found"),
     [
         ({"suite": STRICT, "referent": "fixed"}, {"referent": "drawn", HOLD: HOLD_MEAN, GOALS: 4}),
-        ({"protocol": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
-        ({"protocol": "upstream", "horizon": 5}, {"horizon": 5}),
+        ({"rules": "upstream"}, {"demonstration_prompt": False, "horizon": UPSTREAM_HORIZON}),
+        ({"rules": "upstream", "horizon": 5}, {"horizon": 5}),
         ({}, {"horizon": HORIZON, "seed_base": EVALUATION_SEED}),
     ],
 )
@@ -107,8 +107,8 @@ def test_suite_and_protocol_determine_other_settings(asked: dict[str, Any], foun
 def test_upstream_protocol_has_no_controls() -> None:
     controls = ({"suite": STRICT}, {"referent": "random"}, {"oracle_memory": True}, {"pause_steps": 3}, {"speed": 0.5})
     for asked in (*controls, {"evidence": True}):
-        with pytest.raises(MemobenchError, match="protocol=upstream"):
-            EnvSettings(protocol="upstream", **asked)
+        with pytest.raises(MemobenchError, match="rules=upstream"):
+            EnvSettings(rules="upstream", **asked)
 
 
 @pytest.mark.parametrize(

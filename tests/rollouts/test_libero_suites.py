@@ -112,7 +112,7 @@ def test_published_settings_are_as_before(fake_loop: FakeLoop) -> None:
         (["suite=libero_object", "policy=memobench_random", "episodes=51"], "50 initial states"),
         (["suite=libero_object", "policy=memobench_random", "seed=50", "env.seed_base=7"], "50 initial states"),
         (["suite=libero_object", "policy=memobench_random", "split=validation"], "split=validation is of memory tasks"),
-        (["suite=libero_object", "policy=memobench_random", "protocol=upstream"], "requires protocol=paper"),
+        (["suite=libero_object", "policy=memobench_random", "rules=upstream"], "requires rules=paper"),
         (["suite=libero_object", "policy=memobench_random", "referent=random"], "requires referent=fixed"),
         (["suite=libero_object", "policy=memobench_random", "evidence=true"], "requires evidence=false"),
         (["suite=libero_object", "policy=memobench_random", "difficulty=hard"], "requires difficulty=standard"),

@@ -82,7 +82,7 @@ PLANNED: list[tuple[list[str], dict[str, Any]]] = [
     (["policy=memobench_mem"], {"prompt_in": "steps"}),
     (["seed=20000", "env.seed_base=19990"], {"seed": 20_000, "seed_base": 19_990, "first": 10}),
     (["split=validation"], {"seed": 20_000, "seed_base": 20_000}),
-    (["protocol=upstream"], {"demonstration_prompt": False, "horizon": 990}),
+    (["rules=upstream"], {"demonstration_prompt": False, "horizon": 990}),
     (["suite=strict", "tasks=3"], {"referent": "drawn"}),
     (["horizon=5", "pause_steps=3", "speed=0.5"], {"horizon": 5, "pause_steps": 3, "speed": 0.5}),
     (["replan=5"], {"replan_steps": 5}),

@@ -115,7 +115,7 @@ class Episode:
             task = self.published.variant(variant)
         self.task = task
         self.choice = None if variant is None else Choice(task)
-        if self.settings.protocol == UPSTREAM:
+        if self.settings.rules == UPSTREAM:
             self.progress = Progress(task, UPSTREAM_EVALUATIONS)
             self.sim.reset(self.seed, self.progress.settle)
         else:
@@ -262,14 +262,14 @@ class Episode:
     @property
     def cut_off(self) -> bool:
         """Whether a horizon below the protocol's ended the episode."""
-        whole = UPSTREAM_HORIZON if self.settings.protocol == UPSTREAM else self.settings.usual["horizon"]
+        whole = UPSTREAM_HORIZON if self.settings.rules == UPSTREAM else self.settings.usual["horizon"]
         return self.settings.horizon < whole and self.exec_steps >= self._limit and not (self.success or self.lost)
 
     @property
     def checkpoints_satisfied(self) -> bool:
         """Whether all checkpoints have held, in any order; this ends an episode of the authors' evaluation only."""
         first = self.progress.first_step
-        return self.settings.protocol == UPSTREAM and bool(first) and None not in first
+        return self.settings.rules == UPSTREAM and bool(first) and None not in first
 
     @property
     def done(self) -> bool:

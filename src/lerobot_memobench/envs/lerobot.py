@@ -121,7 +121,7 @@ class MemobenchEnvConfig(_WithSettings):
         self.task, self.task_ids = None if len(suites) == 1 else ",".join(suites), None
         if self.fps != CONTROL_HZ:
             raise MemobenchError(f"env.fps is {self.fps}; the control rate is {CONTROL_HZ}, leave env.fps out")
-        for name, value in asdict(self.settings).items():  # some follow from the protocol and the suite
+        for name, value in asdict(self.settings).items():  # some follow from the rules and the suite
             setattr(self, name, value)
         if self.task_dir is not None and self.tasks != "all":
             raise MemobenchError(

@@ -19,7 +19,7 @@ from lerobot_memobench.constants import (
     HOLD_MEAN,
     IMAGE_SIZE,
     PROMPT_HORIZON,
-    PROTOCOLS,
+    RULES,
     SCENE_HASH_VERSION,
     UPSTREAM,
     UPSTREAM_HORIZON,
@@ -82,7 +82,7 @@ SCENE_HASHES = "scene_hash_version"
 UPSTREAM_ONLY = ("suite", "referent", "oracle_memory", "pause_steps", "speed", "evidence", *MEMORY_CONTROLS)
 """Settings that keep their default in the authors' evaluation."""
 LIBERO_ONLY = (
-    *("difficulty", "protocol", "referent", "oracle_memory", "evidence", "salt", "expert_action", "blind_action"),
+    *("difficulty", "rules", "referent", "oracle_memory", "evidence", "salt", "expert_action", "blind_action"),
     *("obs_type", "demonstration_prompt", *MEMORY_CONTROLS),
 )
 """Settings that keep their default in LIBERO's suites. Their tasks have no checkpoints, prompts, variants and expert,
@@ -118,11 +118,11 @@ class EnvSettings:
     difficulty: str = setting(
         STANDARD, "counts of strict tasks up to 2, 3, 5 or 8, and the number of steps", DIFFICULTIES
     )
-    protocol: str = setting(
+    rules: str = setting(
         BY_PAPER,
         "the paper's evaluation; upstream, the authors' script: no demonstration prompt, fixed referents, at most 990 "
         "steps, an end when all checkpoints have held",
-        PROTOCOLS,
+        RULES,
     )
     seed_base: int = setting(EVALUATION_SEED, "seed of episode 0", least=0, usual="that of seed= or split=")
     obs_type: str = setting(
@@ -236,8 +236,8 @@ class EnvSettings:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
-        if self.protocol == UPSTREAM:
-            self._require(UPSTREAM_ONLY, f"protocol={UPSTREAM}, the authors' evaluation,")
+        if self.rules == UPSTREAM:
+            self._require(UPSTREAM_ONLY, f"rules={UPSTREAM}, the authors' evaluation,")
             self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
         if self.evidence and self.referent == REFERENTS[0]:
             raise MemobenchError(

@@ -13,7 +13,7 @@ from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
-OF_SCENES = ("difficulty", "protocol", *IMAGE_SETTINGS)
+OF_SCENES = ("difficulty", "rules", *IMAGE_SETTINGS)
 CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
 PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
 
