@@ -21,23 +21,16 @@ from lerobot_memobench.cli.console import as_path
 from lerobot_memobench.datasets.episodes import from_frames
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import (
-    Count,
-    Malformed,
-    Name,
-    Number,
-    checked,
     disk_refusal,
     draft_of,
     explaining_disk_errors,
     file_name,
     files_below,
-    parsed,
-    read_json,
-    refusing,
     remove_drafts,
     write_file,
 )
 from lerobot_memobench.tasks.catalogue import task_names
+from lerobot_memobench.untrusted import Count, Malformed, Name, Number, checked, parsed, read_json, refusing
 
 # --- trees ---
 

@@ -15,11 +15,12 @@ from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.record import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import draft_of, read_json, write_file
+from lerobot_memobench.io import draft_of, write_file
 from lerobot_memobench.jobs.processes import Advance
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
+from lerobot_memobench.untrusted import read_json
 from mujoco_raster.highlights import Highlight
 from research.detector.labels import PICTURE, Labeller, Rows, kinds
 from research.detector.randomisation import NEAR, DomainRandomisation, widened, with_distractors

@@ -14,8 +14,8 @@ from typing import Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, counting, say
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import count_of, write_file
+from lerobot_memobench.errors import MemobenchError, count_of
+from lerobot_memobench.io import write_file
 from lerobot_memobench.jobs.processes import Advance, Job
 from lerobot_memobench.jobs.running import run_jobs
 from research.command import run

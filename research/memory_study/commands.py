@@ -16,8 +16,9 @@ from typing import IO, NotRequired, TypedDict
 
 from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import read_json, write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.jobs.threads import sharing
+from lerobot_memobench.untrusted import read_json
 
 MODULES = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
 

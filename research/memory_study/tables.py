@@ -9,12 +9,11 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_run, read_runs
 from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
-from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import MEMORY_TYPES
 from research.memory_study.cells import Cell, difference

@@ -1,4 +1,4 @@
-"""The error class of this package, chains of errors, and hints for messages."""
+"""The error class of this package, chains of errors, and parts of messages."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import difflib
 import sys
 import traceback
 from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
 
 
 class MemobenchError(ValueError):
@@ -63,3 +64,31 @@ def nearest(unknown: str, known: Iterable[str], count: int = 3) -> str:
     if len(words) <= 12:
         return "known are " + ", ".join(repr(word) for word in words)
     return f"none of the {len(words)} known ones is near"
+
+
+LONGEST = 80
+"""Length of quoted values in messages, characters."""
+
+
+def short(value: Any) -> str:
+    """Return the representation of a value, shortened for messages."""
+    return cut(repr(value))
+
+
+def cut(text: str, longest: int = LONGEST) -> str:
+    """Return a text, shortened for messages."""
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def count_of(number: int, word: str) -> str:
+    """Return a number with its noun, such as ``1 task`` or ``1,500 rollouts``."""
+    return f"{number:,} {word}" + ("" if number == 1 else "s")
+
+
+def in_words(size: float) -> str:
+    """Return a number of bytes with its unit, such as ``45.8 GiB``."""
+    number, units = float(size), ["B", "KiB", "MiB", "GiB", "TiB"]
+    while number >= 1024 and len(units) > 1:
+        number /= 1024
+        del units[0]
+    return f"{number:.1f} {units[0]}" if units[0] != "B" else f"{number:.0f} B"

@@ -293,7 +293,7 @@ def test_compressed_evaluations(
         assert main(["report", str(archive)]) == 2
         assert "gzip" in capsys.readouterr().err
     file.write_bytes(whole)
-    monkeypatch.setattr("lerobot_memobench.io.LARGEST_UNPACKED", 100)
+    monkeypatch.setattr("lerobot_memobench.untrusted.LARGEST_UNPACKED", 100)
     with pytest.raises(MemobenchError, match="larger"):
         read_runs([archive])
 

@@ -19,7 +19,7 @@ from lerobot_memobench.evaluation.comparison import Contrast, compare_evaluation
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
-from lerobot_memobench.io import checked, parsed
+from lerobot_memobench.untrusted import checked, parsed
 from tools.board.check import RERUNS, ranked, read_board
 from tools.board.submission import Submission
 

@@ -16,7 +16,8 @@ from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, LOG, About
 from lerobot_memobench.envs.episode_log import EpisodeRecord, joined, key_of
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Malformed, checked, in_words, parsed
+from lerobot_memobench.io import in_words
+from lerobot_memobench.untrusted import Malformed, checked, parsed
 
 LARGEST = {CARD: 2 << 20, LOG: 1 << 20}
 """File -> its largest size, bytes."""

@@ -31,7 +31,8 @@ from lerobot_memobench.envs.evaluation_file import (
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, requested
 from lerobot_memobench.evaluation.report import evaluation_markdown
-from lerobot_memobench.io import PACKED, refuse_links, write_file
+from lerobot_memobench.io import refuse_links, write_file
+from lerobot_memobench.untrusted import PACKED
 
 CARD, LOG = EVALUATION_FILE, MERGED_FILE + PACKED
 CONTROLS = (PAUSES,) = ("pauses",)

@@ -11,9 +11,8 @@ import typer
 
 from lerobot_memobench.cli.console import AnySuite, SuiteOption, Workers, console, counting, say, table
 from lerobot_memobench.envs.settings import OBS_TYPES
-from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.errors import MemobenchError, check_choice, count_of
 from lerobot_memobench.evaluation.tables import Unbroken
-from lerobot_memobench.io import count_of
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.tasks.catalogue import get_task, resolve_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED

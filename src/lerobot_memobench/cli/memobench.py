@@ -23,9 +23,9 @@ from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console,
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, export, merge, report, rerun, submit
 from lerobot_memobench.constants import SEALED
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.tables import Unbroken
-from lerobot_memobench.io import count_of, in_words
+from lerobot_memobench.io import in_words
 from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
 from lerobot_memobench.tasks.catalogue import (
     find_tasks,

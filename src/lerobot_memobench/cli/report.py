@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lerobot_memobench.cli.console import console, note, say
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import checked, count_of, write_file
+from lerobot_memobench.errors import MemobenchError, count_of
+from lerobot_memobench.io import write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
+from lerobot_memobench.untrusted import checked
 
 if TYPE_CHECKING:
     from lerobot_memobench.evaluation.records import Run

@@ -40,24 +40,21 @@ from lerobot_memobench.datasets.stage import (
     stage_failure,
 )
 from lerobot_memobench.datasets.write import assemble
-from lerobot_memobench.errors import MemobenchError, check_choice
+from lerobot_memobench.errors import MemobenchError, check_choice, count_of
 from lerobot_memobench.io import (
-    Count,
-    check_fetched,
-    count_of,
     draft_of,
     explaining_disk_errors,
     file_name,
     files_below,
     free_bytes,
     in_words,
-    read_json,
     write_file,
 )
 from lerobot_memobench.jobs.processes import Advance, ProgressCallback
 from lerobot_memobench.jobs.running import run_jobs
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
+from lerobot_memobench.untrusted import Count, check_fetched, read_json
 
 SUFFIXES = (".hdf5", ".h5")
 MACOS_FOLDER = "__MACOSX"

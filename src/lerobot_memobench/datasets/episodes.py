@@ -34,22 +34,21 @@ from lerobot_memobench.datasets.layout import (
     is_dataset,
 )
 from lerobot_memobench.envs.settings import STRICT_GOALS
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import (
+from lerobot_memobench.errors import MemobenchError, short
+from lerobot_memobench.io import files_below
+from lerobot_memobench.tasks.catalogue import suite_of
+from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.untrusted import (
     Count,
     Malformed,
     Number,
     Whole,
     check_fetched,
     checked,
-    files_below,
     parsed,
     read_json,
     refusing,
-    short,
 )
-from lerobot_memobench.tasks.catalogue import suite_of
-from lerobot_memobench.tasks.task import STRICT
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -60,7 +59,7 @@ Filter = list[tuple[str, str, int]]
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
-    """Turn errors of reading the dataset in ``folder``, or one of its files, into `MemobenchError` (`io.refusing`)."""
+    """Turn errors of reading a dataset, or one of its files, into `MemobenchError` (`untrusted.refusing`)."""
     return refusing(lambda why: MemobenchError(f"{folder} cannot be read ({why}); {ADVICE}"), folder)
 
 

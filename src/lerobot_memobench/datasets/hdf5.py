@@ -28,13 +28,8 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import (
-    Malformed,
-    check_fetched,
-    check_regular,
-    parsed,
-    refusing,
-)
+from lerobot_memobench.io import check_regular
+from lerobot_memobench.untrusted import Malformed, check_fetched, parsed, refusing
 
 if TYPE_CHECKING:
     import h5py

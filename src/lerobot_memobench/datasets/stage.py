@@ -33,10 +33,11 @@ from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow,
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
 from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, read_json, refuse_links, remove_drafts, short, write_file
+from lerobot_memobench.errors import MemobenchError, short
+from lerobot_memobench.io import file_hash, refuse_links, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
+from lerobot_memobench.untrusted import read_json
 
 TEMPORARY = ".tmp-"
 REQUEST_FILE = "request.json"

@@ -18,8 +18,9 @@ from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
 from lerobot_memobench.datasets.layout import ADVICE, STATS_FILE
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, frame_reader
 from lerobot_memobench.datasets.write import numeric_stats
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import explaining_disk_errors, read_json, short, write_file
+from lerobot_memobench.errors import MemobenchError, short
+from lerobot_memobench.io import explaining_disk_errors, write_file
+from lerobot_memobench.untrusted import read_json
 
 IMAGES, TEXTS = ("video", "image"), ("string", "language")
 BLOCK = 64

@@ -49,9 +49,9 @@ from lerobot_memobench.datasets.layout import (
 )
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.datasets.video import FrameReader, frame_reader
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of, cut
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
-from lerobot_memobench.io import check_fetched, count_of, cut, file_hash, files_below, refusing
+from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
 from lerobot_memobench.sim.object_slots import ObjectSlots
@@ -59,6 +59,7 @@ from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.untrusted import check_fetched, refusing
 
 COMPARED = ("task_name", "seed", "referent", "variant", "success", "scene_hash", "digest")
 """Fields of an episode in the manifest that its record has too."""

@@ -18,25 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal, NotRequired, TypedDict
 
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLICY, read_evaluation, write_facts
 from lerobot_memobench.envs.settings import INTACT, steps_per_action
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import (
-    Count,
-    Malformed,
-    Name,
-    Number,
-    Whole,
-    checked,
-    count_of,
-    file_bytes,
-    file_name,
-    packed,
-    parsed,
-    write_file,
-)
+from lerobot_memobench.errors import MemobenchError, count_of
+from lerobot_memobench.io import file_name, write_file
 from lerobot_memobench.tasks.catalogue import group_of, suite_of
 from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import REFERENTS, STRICT, Task
+from lerobot_memobench.untrusted import Count, Malformed, Name, Number, Whole, checked, file_bytes, packed, parsed
 
 if TYPE_CHECKING:
     from lerobot_memobench.envs.episode import Episode

@@ -16,8 +16,9 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict
 from annotated_types import Ge, Le, MinLen
 
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, EnvSettings
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LARGEST, Count, Name, Number, Whole, cut, is_there, read_json, write_file
+from lerobot_memobench.errors import MemobenchError, cut
+from lerobot_memobench.io import write_file
+from lerobot_memobench.untrusted import LARGEST, Count, Name, Number, Whole, is_there, read_json
 
 EVALUATION_FILE = "evaluation.json"
 FORMAT = 3

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.settings import SETTINGS
-from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.errors import MemobenchError, count_of, nearest
 from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
 from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
@@ -61,7 +61,6 @@ from lerobot_memobench.evaluation.tables import (
     percent_text,
     with_ids,
 )
-from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
 from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from lerobot_memobench.constants import PAPER, SPLITS
 from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.envs.settings import DEFAULTS, IMAGE_SETTINGS, MEMORY_CONTROLS
+from lerobot_memobench.errors import count_of, cut
 from lerobot_memobench.evaluation.metrics import Record, inputs_phrase, stand_ins_of
 from lerobot_memobench.evaluation.records import Run
-from lerobot_memobench.io import count_of, cut
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 OF_SCENES = ("difficulty", "rules", *IMAGE_SETTINGS)

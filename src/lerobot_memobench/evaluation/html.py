@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 from lerobot_memobench import __version__
 from lerobot_memobench.constants import CONTROL_HZ
 from lerobot_memobench.envs.video import LAST_FRAMES, OPERATION_COLOURS
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_phrase
 from lerobot_memobench.evaluation.headline import headline
@@ -43,7 +43,7 @@ from lerobot_memobench.evaluation.metrics import (
 from lerobot_memobench.evaluation.records import Run, read_runs, unlike
 from lerobot_memobench.evaluation.report import evaluation_report, outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
-from lerobot_memobench.io import count_of, draft_of, file_name, refuse_links, write_file
+from lerobot_memobench.io import draft_of, file_name, refuse_links, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
 from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, load_task, suite_of

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
 
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import count_of
+from lerobot_memobench.errors import MemobenchError, count_of, nearest
 from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
 from lerobot_memobench.tasks.libero_suites import libero_id

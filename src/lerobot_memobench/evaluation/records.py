@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
 from lerobot_memobench.envs.evaluation_file import EXTENT, MOST_EPISODES, POLICY, differences, read_evaluation
 from lerobot_memobench.envs.settings import IMAGE_SETTINGS, SCENE_HASHES
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
 from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, summary_of
-from lerobot_memobench.io import count_of
 from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from lerobot_memobench.envs.episode_log import read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import POLICY
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.comparison import comparison_data, comparison_section, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
 from lerobot_memobench.evaluation.headline import headline
@@ -47,7 +47,7 @@ from lerobot_memobench.evaluation.tables import (
     to_markdown,
     with_ids,
 )
-from lerobot_memobench.io import count_of, write_file
+from lerobot_memobench.io import write_file
 from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
 from lerobot_memobench.tasks.task import LEVELS, MEMORY_TYPES
 

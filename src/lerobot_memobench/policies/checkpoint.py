@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LONGEST_NAME, Count, check_fetched, file_name, refusing
-from lerobot_memobench.io import read_json as read_json_file
+from lerobot_memobench.io import LONGEST_NAME, file_name
+from lerobot_memobench.untrusted import Count, check_fetched, refusing
+from lerobot_memobench.untrusted import read_json as read_json_file
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

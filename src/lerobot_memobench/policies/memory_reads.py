@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.envs.settings import RESET
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import Count, Name, Number, Whole, count_of, file_name, read_json, write_file
+from lerobot_memobench.errors import MemobenchError, count_of
+from lerobot_memobench.io import file_name, write_file
 from lerobot_memobench.tasks.task import PUBLISHED
+from lerobot_memobench.untrusted import Count, Name, Number, Whole, read_json
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidMessage, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LONGEST_REASON, Malformed, cut, refusing, short
+from lerobot_memobench.errors import MemobenchError, cut, short
 from lerobot_memobench.sim.convention import STATED
+from lerobot_memobench.untrusted import LONGEST_REASON, Malformed, refusing
 
 logger = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from typing import Any
 from lerobot_memobench.envs.evaluation_file import FORMAT, INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, files_below, read_json
+from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.threads import cores, cpu_model
 from lerobot_memobench.policies.checkpoint import (
     ADAPTER_FILE,
@@ -35,6 +35,7 @@ from lerobot_memobench.policies.lerobot_config import (
     tree_hash,
 )
 from lerobot_memobench.rollouts.plan import EvaluationPlan
+from lerobot_memobench.untrusted import read_json
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
 

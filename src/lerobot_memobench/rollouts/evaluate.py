@@ -28,10 +28,10 @@ from lerobot_memobench.envs.evaluation_file import (
 )
 from lerobot_memobench.envs.lerobot import Opener
 from lerobot_memobench.envs.settings import SWAP
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.evaluation.report import write_report
-from lerobot_memobench.io import count_of, refuse_links, remove_drafts
+from lerobot_memobench.io import refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.jobs.threads import limit_torch
 from lerobot_memobench.policies.checkpoint import check_weights, portable_path

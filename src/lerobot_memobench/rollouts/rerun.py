@@ -34,14 +34,14 @@ from lerobot_memobench.envs.episode_log import key_of, read_log
 from lerobot_memobench.envs.evaluation_file import MOST_EPISODES, differences, read_evaluation
 from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
-from lerobot_memobench.io import Malformed, checked, count_of, parsed
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
 from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
 from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
+from lerobot_memobench.untrusted import Malformed, checked, parsed
 
 MOST_STEPS = 400 * HORIZON
 """Most control steps of an episode with its pauses and holds; those of a strict one may take 180,000."""

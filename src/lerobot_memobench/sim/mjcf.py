@@ -18,10 +18,11 @@ import mujoco
 import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import file_name, refusing
+from lerobot_memobench.io import file_name
 from lerobot_memobench.sim import files
 from lerobot_memobench.sim.asset import ALL_CLASSES, ARENAS, CLASSES, QUARTER, TABLE, Turn, split_class
 from lerobot_memobench.tasks.task import STRICT
+from lerobot_memobench.untrusted import refusing
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
 REFERENCES = ("mesh", "material", "texture")

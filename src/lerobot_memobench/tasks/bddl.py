@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import cut
+from lerobot_memobench.errors import MemobenchError, cut, nearest
 from lerobot_memobench.tasks.formula import (
     LATCHES,
     MAX_DEPTH,

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.io import existing_spelling, files_below, refusing
+from lerobot_memobench.io import existing_spelling, files_below
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
 from lerobot_memobench.tasks.gap import gaps
@@ -33,6 +33,7 @@ from lerobot_memobench.tasks.task import (
     PromptKind,
     Task,
 )
+from lerobot_memobench.untrusted import refusing
 
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over all suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"

@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import short
+from lerobot_memobench.errors import MemobenchError, nearest, short
 
 #: Predicate (lower case) -> (spelling in BDDL, number of arguments).
 PREDICATES: dict[str, tuple[str, int]] = {

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
-from lerobot_memobench.io import refusing
 from lerobot_memobench.tasks.bddl import parse_bddl
 from lerobot_memobench.tasks.task import LIBERO_SUITES, LiberoSuite, Task
+from lerobot_memobench.untrusted import refusing
 
 FOLDER = Path(__file__).parent / "libero"
 SCENE_LANGUAGE = "SCENE"

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal, NotRequired, TypedDict, cast
 
 from annotated_types import Ge, Le, Len, MinLen
 
-from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.io import read_json, short
+from lerobot_memobench.errors import MemobenchError, nearest, short
 from lerobot_memobench.tasks.bddl import Problem
 from lerobot_memobench.tasks.formula import Formula, parse_formula, rename
 from lerobot_memobench.tasks.task import (
@@ -28,6 +27,7 @@ from lerobot_memobench.tasks.task import (
     Texts,
     Variant,
 )
+from lerobot_memobench.untrusted import read_json
 
 LevelTexts = Annotated[list[str], Len(3, 3)]
 LevelLabels = Annotated[list[Annotated[int, Ge(0), Le(2)]], Len(3, 3)]

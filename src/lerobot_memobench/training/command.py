@@ -32,7 +32,6 @@ from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
 from lerobot_memobench.errors import MemobenchError, check_choice
-from lerobot_memobench.io import check_fetched
 from lerobot_memobench.jobs.processes import adding_resume_hint, locked
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.policies.checkpoint import CONFIG_FILE as POLICY_CONFIG
@@ -54,6 +53,7 @@ from lerobot_memobench.policies.checkpoint import (
     text_of_link,
 )
 from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
+from lerobot_memobench.untrusted import check_fetched
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig

@@ -41,8 +41,7 @@ from lerobot_memobench.datasets.layout import EPISODE_INFO, without_pattern
 from lerobot_memobench.datasets.statistics import complete, lacking, needed_by
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import OBJECTS
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import count_of
+from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.policies.compatibility import check_features, trained_convention
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ANSWERS,
