@@ -21,12 +21,7 @@ from lerobot_memobench.perception.objects import (
     projected,
     views_of,
 )
-from lerobot_memobench.perception.weights import (
-    PACKAGE,
-    load_detector,
-    load_visual_encoder,
-    warn_of_former_scenes,
-)
+from lerobot_memobench.perception.weights import PACKAGE, load_detector, load_visual_encoder, warn_of_former_scenes
 from lerobot_memobench.policies.memobench_mem.objects import in_order
 from lerobot_memobench.sim.asset import TABLE_TOP, split_class
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
@@ -49,7 +44,6 @@ def localizer() -> ObjectLocalizer:
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
-    """Return the detections of a detector without errors."""
     things = row["things"][: row["count"]]
     detected = np.zeros(len(things), DETECTION)
     place, depth = projected(things["position"].astype(float), row)
@@ -60,7 +54,6 @@ def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
 
 
 def bent(sim: Simulation) -> Simulation:
-    """Bend the arm to another place."""
     here, turned = sim.eef_pose()
     assert reach(sim, here + np.array([0.1, -0.08, -0.1]), turned)
     settle(sim)
