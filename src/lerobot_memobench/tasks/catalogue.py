@@ -6,6 +6,7 @@ inferred from the folder name and the instruction.
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter
 from functools import cache
@@ -16,7 +17,6 @@ from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.io import existing_spelling, files_below
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
-from lerobot_memobench.tasks.gap import gaps
 from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
 from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_tasks
 from lerobot_memobench.tasks.metadata import Metadata
@@ -26,6 +26,7 @@ from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     METADATA_FILE,
     PUBLISHED,
+    STRICT,
     SUITES,
     Checkpoint,
     MemoryType,
@@ -257,9 +258,54 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
             }
             for checkpoint in task.checkpoints
         ],
-        "gaps": [None if gap is None else gap._asdict() for gap in gaps(task)],
+        "gaps": [None if distance is None else distance._asdict() for distance in cue_to_use(task)],
         "state_dim": int(state_dim),
     }
+
+
+CUE_TO_USE_FILE = Path(__file__).with_name("cue_to_use.json")
+"""Measured by ``scripts/cue_to_use.py`` on the scripted expert; ``docs/benchmark/gap.md`` defines it."""
+
+
+class CueToUse(NamedTuple):
+    """Control steps from the cue of a checkpoint to its use over the expert's episodes, without holds.
+
+    ``held``: whether the first hold lies between cue and use.
+    """
+
+    least: int
+    median: int
+    most: int
+    held: bool
+
+    def __str__(self) -> str:
+        return f"{self.median} + hold" if self.held else str(self.median)
+
+
+def cue_in_prompt(task: Task, checkpoint: int) -> bool:
+    """Return whether the demonstration prompt shows the answer to a checkpoint (0 is the first)."""
+    # After a hiding, only the first choice, the drawer, depends on the prompt.
+    return task.prompt is not None and (task.prompt.kind != "hide" or checkpoint == 0)
+
+
+def cue_to_use(task: Task) -> tuple[CueToUse | None, ...]:
+    """Return the steps of each checkpoint, () for a task that was not measured; None: nothing has to be remembered."""
+    return tuple(
+        None if row is None else CueToUse(*row, held=task.suite == STRICT and cue_in_prompt(task, k))
+        for k, row in enumerate(_measured_cues().get(task.name, []))
+    )
+
+
+def longest_cue_to_use(task: Task) -> CueToUse | None:
+    """Return the largest median of a task's checkpoints; None for a task without one or not measured."""
+    known = [distance for distance in cue_to_use(task) if distance is not None]
+    return max(known, key=lambda distance: (distance.held, distance.median), default=None)
+
+
+@cache
+def _measured_cues() -> dict[str, list[tuple[int, int, int] | None]]:
+    rows: dict[str, list[tuple[int, int, int] | None]] = json.loads(CUE_TO_USE_FILE.read_text())
+    return rows
 
 
 def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
