@@ -461,7 +461,7 @@ def solved_by_routine() -> dict[str, float]:
 
 def without_memory(task: Any) -> dict[str, str]:
     """Return referent -> rate without a memory: routine or chance of a published task, ceiling of a strict one."""
-    from lerobot_memobench.tasks.evidence import chance
+    from lerobot_memobench.tasks.assessment import chance
     from research.necessity.adversaries import ceiling
 
     if task.suite == "strict":

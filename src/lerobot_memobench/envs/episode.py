@@ -43,9 +43,8 @@ from lerobot_memobench.sim.simulation import (
     UnstablePhysicsError,
     as_action,
 )
+from lerobot_memobench.tasks.assessment import INVALID_ACTION, UNSTABLE_PHYSICS, Choice
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evidence import Choice
-from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
@@ -55,7 +54,7 @@ from mujoco_raster.drawlist import Image
 
 
 class Fault(NamedTuple):
-    """Reason of an aborted execution: one of `tasks.failures.FAULTS`, and a sentence."""
+    """Reason of an aborted execution: one of `tasks.assessment.FAULTS`, and a sentence."""
 
     failure: str
     why: str

@@ -1,6 +1,6 @@
 """Define, build, check, traverse and format formulas of goals and checkpoints: trees of operators over atoms.
 
-The published tasks use four operators; the strict suite adds five. The simulator evaluates atoms. `tasks.nodes`
+The published tasks use four operators; the strict suite adds five. The simulator evaluates atoms. `tasks.progress`
 implements operators and latches (``wasopen``, ``wasturnedon``) over time, see ``docs/benchmark/formulas.md``.
 """
 
