@@ -44,9 +44,8 @@ from lerobot_memobench.sim.simulation import (
     as_action,
 )
 from lerobot_memobench.tasks.assessment import INVALID_ACTION, UNSTABLE_PHYSICS, Choice
-from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.catalogue import get_task, initial_states
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import AS_BEGUN, Progress
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text

@@ -16,8 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
 from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES, classify
-from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.catalogue import GROUPS, libero_id, suite_of
 from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]

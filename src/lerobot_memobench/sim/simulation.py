@@ -183,7 +183,7 @@ class Simulation:
 
         Args:
             settling: called with `holds` after each stabilisation step.
-            state: initial state (state_dim,) of arm, objects and joints, as of `tasks.libero_suites`. The seed then
+            state: initial state (state_dim,) of arm, objects and joints, as of `tasks.catalogue`. The seed then
                 draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
                 and ``set_init_state`` do.
 

@@ -28,7 +28,7 @@ MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
-#: LIBERO's own suites (`tasks.libero_suites`), whose tasks have no checkpoints.
+#: LIBERO's own suites (`tasks.catalogue`), whose tasks have no checkpoints.
 LIBERO_SUITES: tuple[LiberoSuite, ...] = get_args(LiberoSuite)
 #: Difficulty of strict tasks -> largest number of repetitions that a counting task asks for. Each one draws from the
 #: variants of the easier ones and its own (`Variant.difficulty`).
