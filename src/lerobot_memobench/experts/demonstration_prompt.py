@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.grasping import pick, put_at
-from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Array, Hand, Steps
+from lerobot_memobench.experts.hand import CLOSED, OPEN, UP, Hand, Steps
 from lerobot_memobench.experts.travel import HAND_HOME, go_home, pointing
 from lerobot_memobench.sim.simulation import Simulation
 from lerobot_memobench.tasks.formula import Atom
@@ -47,25 +47,25 @@ class PromptDemonstrator:
         yield from hand.wait(PAUSE_STEPS, OPEN)
         match self._prompt.kind:
             case "routine":
-                yield from self._routine(*home)
+                expert = Expert(self._task, self._sim, self._rng)
+                while not expert.done:
+                    yield expert.act()
+                self.succeeded = expert.succeeded
+                yield from go_home(expert.hand, *home)
             case "pick":
                 yield from self._pick(hand)
             case "point":
                 yield from self._point(hand)
             case "highlight":
-                yield from self._highlight(hand)
+                self._sim.highlights = highlights_at(self._task, self._sim, PAUSE_STEPS)
+                self.succeeded = True
+                yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
+                self._sim.highlights = ()
             case "hide":
                 yield from self._hide()
                 return
         yield from go_home(hand, *home)
         yield from hand.wait(PAUSE_STEPS, OPEN)
-
-    def _routine(self, position: Array, rotation: Array) -> Steps:
-        expert = Expert(self._task, self._sim, self._rng)
-        while not expert.done:
-            yield expert.act()
-        self.succeeded = expert.succeeded
-        yield from go_home(expert.hand, position, rotation)
 
     def _hide(self) -> Steps:
         """Put each object into its drawer, close the drawer, and return home; shown if all objects are hidden."""
@@ -99,12 +99,6 @@ class PromptDemonstrator:
         yield from hand.wait(PAUSE_STEPS, CLOSED)
         self.succeeded = bool(np.linalg.norm((hand.position - position)[:2]) < 0.03)
         yield from hand.move(above + 0.10 * UP, rotation, CLOSED, tolerance=0.02)
-
-    def _highlight(self, hand: Hand) -> Steps:
-        self._sim.highlights = highlights_at(self._task, self._sim, PAUSE_STEPS)
-        self.succeeded = True
-        yield from hand.wait(HIGHLIGHT_STEPS, OPEN)
-        self._sim.highlights = ()
 
 
 def highlights_at(task: Task, sim: Simulation, frame: int) -> tuple[Highlight, ...]:

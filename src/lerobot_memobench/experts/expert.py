@@ -38,6 +38,7 @@ from lerobot_memobench.tasks.formula import (
     Then,
     When,
     children,
+    walk,
 )
 from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -89,7 +90,7 @@ def hold_steps_of(formula: Formula) -> int:
 
 def counts_events(formula: Formula) -> bool:
     """Return whether a formula counts events."""
-    return isinstance(formula, Exactly) or any(counts_events(child) for child in children(formula))
+    return any(isinstance(part, Exactly) for part in walk(formula))
 
 
 def plan_of(formula: Formula) -> list[Step]:
@@ -125,7 +126,6 @@ def _rank(formula: Formula) -> int:
 
 
 def _merge_plans(plans: list[list[Step]]) -> list[Step]:
-    """Return one plan that contains all plans, with shared steps once."""
     merged: list[Step] = []
     for plan in plans:
         remaining = iter(merged)
@@ -212,9 +212,9 @@ class Expert:
             case (("handhome" | "asbegun"), ()):
                 yield from come_home(self.hand, *self.sim.home)
             case (("open" | "wasopen"), (name,)):
-                yield from self._open(name)
+                yield from self._set_open(name, True)
             case "close", (name,):
-                yield from self._close(name)
+                yield from self._set_open(name, False)
             case (("turnon" | "wasturnedon"), (name,)):
                 yield from fixtures.turn_knob(self.hand, name, on=True)
             case "turnoff", (name,):
@@ -246,7 +246,6 @@ class Expert:
             yield from put_on_region(self.hand, held, self._region_top(support))
 
     def _region_top(self, region: str) -> NDArray[np.float64]:
-        """Return the centre (3,) of a region's upper face, m."""
         declared = self.task.regions.get(region)
         if declared is not None and declared.target == TABLE:
             x1, y1, x2, y2 = declared.ranges[0]
@@ -254,14 +253,12 @@ class Expert:
         centre, rotation, half = region_box(self.hand, region)
         return centre + rotation @ np.array([0.0, 0.0, half[2]])
 
-    def _open(self, name: str) -> Steps:
-        # Not `Hand.strict`: the blind routine solves a published task in a strict scene.
-        door = fixtures.sweep_door_open if self.task.suite == STRICT else fixtures.open_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.open_drawer)(self.hand, name)
-
-    def _close(self, name: str) -> Steps:
-        door = fixtures.sweep_door_shut if self.task.suite == STRICT else fixtures.close_door
-        return (door if self.sim.world.articulation(name)[0].kind == "door" else fixtures.close_drawer)(self.hand, name)
+    def _set_open(self, name: str, opening: bool) -> Steps:
+        if self.sim.world.articulation(name)[0].kind != "door":
+            return (fixtures.open_drawer if opening else fixtures.close_drawer)(self.hand, name)
+        if self.task.suite == STRICT:  # not `Hand.strict`: the blind routine solves a published task in a strict scene
+            return (fixtures.sweep_door_open if opening else fixtures.sweep_door_shut)(self.hand, name)
+        return (fixtures.open_door if opening else fixtures.close_door)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:
         drawers = [name for name, (articulation, _) in self.sim.world.joints.items() if articulation.kind == "drawer"]
@@ -270,7 +267,7 @@ class Expert:
             raise MemobenchError(f"the expert places objects into drawers only, and {region!r} is not a drawer; {hint}")
         articulation, q = self.sim.world.articulation(region)
         if q > articulation.open_below:
-            yield from self._open(region)
+            yield from self._set_open(region, True)
         out = opening_direction(self.hand, articulation)
         held = yield from pick(self.hand, name, avoid=out)
         if held is not None:

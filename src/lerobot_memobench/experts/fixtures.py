@@ -152,7 +152,6 @@ def open_drawer(hand: Hand, region: str) -> Steps:
 
 
 def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
-    """Pull a drawer by its handle until it is open or the handle slips."""
     for _ in range(90):
         articulation, q = hand.sim.world.articulation(region)
         if q < articulation.open_below - 0.006:
@@ -201,7 +200,6 @@ def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, ou
 
 
 def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array, aside: Array) -> Steps:
-    """Push a drawer by its handle until it is closed or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
     spare = min(0.003, articulation.closed_q - articulation.closed_above)
     shut = sustained(lambda: _joint_position(hand, region) > articulation.closed_above + spare)
@@ -384,7 +382,6 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
 
 
 def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
-    """Return whether the swing ends: the door is at its goal, can be pushed by its handle, or has slipped."""
     if door_is_at_goal(door.q, articulation, opening):
         return True
     if not opening and distance_from_base(door.handle + PUSH_GAP * door.outward) < DOWNWARD_REACH - 0.04:
@@ -444,7 +441,6 @@ def sweep_door_shut(hand: Hand, name: str) -> Steps:
 
 
 def _sweep_rotation(hand: Hand, door: Door, position: Array, flip: float) -> Array:
-    """Return the rotation (3, 3) of a hand that closes along the door, leaned to reach a position (3,)."""
     closing = flip * door.along
     lean = reach_lean(hand, position)
     return leaned_rotation(closing, lean - (lean @ closing) * closing)

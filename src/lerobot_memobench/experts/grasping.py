@@ -226,7 +226,6 @@ class _Approach:
 
 
 def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, place: Array | None) -> _Approach:
-    """Choose one of an object's grasps by cost; later attempts choose other candidates."""
     asset = hand.sim.assets[name]
     if not asset.grasps:
         raise MemobenchError(
@@ -260,7 +259,6 @@ def _options(
 
 
 def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
-    """Return the grasps of a tall object moved closer to its top."""
     return tuple(
         replace(grasp, position=(*grasp.position[:2], grasp.position[2] + RAISED_GRASP_OFFSET))
         for grasp in asset.grasps

@@ -138,7 +138,6 @@ def obstacle_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
 
 
 def _objects(hand: Hand, *but: str) -> Iterator[tuple[Asset, Array, Array]]:
-    """Yield objects with their positions (3,) and rotations (3, 3), except those of some names."""
     for name, asset in hand.sim.assets.items():
         if asset.kind == "object" and name not in but:
             yield asset, *hand.sim.asset_pose(name)

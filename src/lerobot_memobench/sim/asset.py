@@ -98,7 +98,6 @@ class Asset:
     ``articulations``: region name, or ``""`` for the whole fixture -> joint.
     ``supports``: height of the supporting surface in the body's frame: a bowl's floor, else the top [m];
     ``clear_radius``: radius of that surface [m].
-    ``glow``: full names of visual geoms that glow while the fixture is on.
     ``round``: whether the outline from above is a circle about the origin.
     ``upright``: rotation from the asset's frame to the body's if another body axis than z points up; all values are in
     the asset's frame.
@@ -114,7 +113,6 @@ class Asset:
     regions: Mapping[str, str] = field(default_factory=dict)
     supports: float = 0.0
     clear_radius: float = 0.0
-    glow: tuple[str, ...] = ()
     round: bool = False
     upright: Quaternion | None = None
 
@@ -192,7 +190,6 @@ class LiberoClass:
 
 
 def _bowl(radius: float, height: float, width: float, *, floor: float, clear: float) -> LiberoClass:
-    """Return a class whose rim of this radius, height and width is grasped."""
     rim = Grasp((radius, 0.0, height), ALONG_X, width, symmetric=True)
     return LiberoClass(SCANNED, grasps=(rim,), floor=floor, clear=clear, round=True)
 

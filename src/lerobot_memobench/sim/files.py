@@ -11,10 +11,10 @@ import contextlib
 import hashlib
 import importlib.util
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 from huggingface_hub import constants
@@ -57,58 +57,45 @@ def known_hashes() -> dict[str, str]:
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
-@dataclass(frozen=True)
-class AssetsFolder:
-    """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
+class AssetsFolder(NamedTuple):
+    """A folder with LIBERO's assets, and how it was found."""
 
     source: str
     folder: Path
-    fault: str = ""
 
 
-def places() -> list[AssetsFolder]:
-    """Return the folders with LIBERO's assets in the order of use, to the first one without a fault."""
-    folders = []
+def find_assets() -> tuple[AssetsFolder | None, str]:
+    """Return the first place with all files, None without one, and a message's part on the incomplete places before."""
+    unused = ""
     for source, folder in _candidates():
         try:
             _verified(folder)
         except MemobenchError as error:
-            folders.append(AssetsFolder(source, folder, str(error)))
+            unused += f"; not used: {source}, {error}"
         else:
-            return [*folders, AssetsFolder(source, folder)]
-    return folders
+            return AssetsFolder(source, folder), unused
+    return None, unused
 
 
-def check_assets() -> Path:
-    """Return the folder of LIBERO's assets, with every file verified.
+def located() -> AssetsFolder:
+    """Return the place of LIBERO's assets, with every file verified.
 
     Raises:
         MemobenchError: no place has all files; the message lists incomplete places and how to obtain the files.
     """
+    place, unused = find_assets()
+    if place is None:
+        raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused}; {OBTAIN}")
+    return place
+
+
+def check_assets() -> Path:
+    """Return the folder of LIBERO's assets; errors as of `located`."""
     return located().folder
 
 
-def located() -> AssetsFolder:
-    """Return the place of LIBERO's assets that is used; errors as of `check_assets`."""
-    if (folder := usable(folders := places())) is not None:
-        return folder
-    raise MemobenchError(
-        f"LIBERO's assets, which every scene needs, are not on this machine{unused(folders)}; {OBTAIN}"
-    )
-
-
-def usable(found: Sequence[AssetsFolder]) -> AssetsFolder | None:
-    """Return the one of the `places` that is used, None if all have a fault."""
-    return found[-1] if found and not found[-1].fault else None
-
-
-def unused(found: Iterable[AssetsFolder]) -> str:
-    """Return the part of a message that names places with a fault."""
-    return "".join(f"; not used: {folder.source}, {folder.fault}" for folder in found if folder.fault)
-
-
 def asset(name: str) -> Path:
-    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `check_assets`."""
+    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `located`."""
     return _verified(check_assets())[name]
 
 
@@ -226,10 +213,10 @@ def obtain() -> AssetsFolder:
     import httpx
     from huggingface_hub import snapshot_download
 
-    folders = places()
-    if (folder := usable(folders)) is not None:
-        return folder
-    wanted, damaged = [*known_hashes()], any(folder.source == HUB_CACHE for folder in folders)
+    place, unused = find_assets()
+    if place is not None:
+        return place
+    wanted, damaged = [*known_hashes()], HUB_CACHE in unused
     try:
         snapshot_download(REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
     except (OSError, httpx.TransportError) as error:

@@ -157,8 +157,6 @@ def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None
 
 
 def _inside(path: Path) -> Callable[[str], Path]:
-    """Return a function that finds the files that ``path`` references in its folder."""
-
     def inside(name: str) -> Path:
         file = (path.parent / name).resolve()
         if not file.is_relative_to(path.parent.resolve()) or not file.is_file():
@@ -214,7 +212,6 @@ def format_numbers(values: Iterable[float]) -> str:
 
 
 def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
-    """Return a copy of a body with the file's default classes resolved."""
     defaults = {
         (default.get("class", ""), element.tag): element.attrib
         for default in root.iter("default")

@@ -212,7 +212,6 @@ def fill_slots(things: Array, places: Array | None = None) -> NDArray[np.float32
 
 
 def _geom_points(model: mujoco.MjModel, geom: int) -> Array:
-    """Return points (n, 3) on a geom's surface in its frame: a mesh's vertices, else its bounding box's corners."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
@@ -233,6 +232,5 @@ def _farthest(points: Array, count: int) -> Array:
 
 
 def _in_image(rays: Array, fovy: float) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the rays (n, 3) in a camera's frame (looking along -z) that hit its square image."""
     edge = -rays[:, 2] * np.tan(np.radians(fovy) / 2)
     return (np.abs(rays[:, 0]) < edge) & (np.abs(rays[:, 1]) < edge)

@@ -12,7 +12,7 @@ Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come fr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -39,17 +39,6 @@ Pose = NDArray[np.float64]
 """Position and quaternion wxyz, (7,)."""
 
 
-def _placing_atoms(task: Task, assets: Iterable[str]) -> list[Atom]:
-    """Return the placing `init` atom of each instance, in the order of `init`."""
-    placing = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
-    missing = [name for name in assets if name not in placing]
-    if missing:
-        raise MemobenchError(
-            f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
-        )
-    return list(placing.values())
-
-
 class Placer:
     """Place fixtures and objects of one simulation by the `init` atoms of its task.
 
@@ -60,7 +49,11 @@ class Placer:
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
         self._arena = arena_of(task)
-        self._places = _placing_atoms(task, assets)
+        self._placing = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+        for name in assets:
+            if name not in self._placing:
+                advice = f"add (On {name} <region>) to its :init"
+                raise MemobenchError(f"task {task.name} has no start for {name!r}; {advice}")
         self._files = {name: class_file(asset.class_name, task.suite) for name, asset in assets.items()}
 
     def place(self, seed: int, draw: int = 0) -> None:
@@ -84,7 +77,6 @@ class Placer:
         self._write(poses, joints)
 
     def _write(self, poses: Mapping[str, Pose], joints: Mapping[str, float]) -> None:
-        """Write poses of fixtures and objects, and positions of joints; keep velocities."""
         model, data = self._model, self._data
         for name, pose in poses.items():
             if self._assets[name].kind == "fixture":
@@ -108,7 +100,7 @@ class Placer:
                 return 2
             return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
 
-        return sorted(self._places, key=rank)
+        return sorted(self._placing.values(), key=rank)
 
     # --- joints ---
 
@@ -193,7 +185,6 @@ class Placer:
 
 
 def _is_clear_of(thing: ClassFile, position: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
-    """Return whether an object's disc is clear of another's, or far enough above it."""
     distance = np.hypot(position[0] - pose[0], position[1] - pose[1])
     return bool(distance > other.radius + thing.radius or position[2] - pose[2] > other.top - thing.bottom)
 

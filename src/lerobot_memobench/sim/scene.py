@@ -192,7 +192,6 @@ def scene_xml(task: Task, visuals: bool) -> str:
 
 
 def _place_arm(world: ET.Element, arena: Arena) -> None:
-    """Move the arm to its place in an arena, and remove its mount in arenas without one."""
     base, mount = _body(world, "robot0_base"), _body(world, "mount0_base")
     x, y, z = arena.base
     if arena.mounted:
@@ -208,7 +207,6 @@ def _body(root: ET.Element, name: str) -> ET.Element:
 
 
 def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
-    """Yield the elements of an arena, with the table's layout from LIBERO's code and the task's regions."""
     for element in room.iterfind("worldbody/*"):
         if element.tag == "body" and element.get("name") == arena.body:
             if arena.lays_out:
@@ -240,7 +238,6 @@ def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> 
 
 
 def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
-    """Yield the sites of the table's regions, one for the first range of each."""
     x, y, z = arena.zones
     for name, region in task.regions.items():
         if task.fixtures.get(region.target) in ARENAS and region.ranges:
@@ -251,7 +248,6 @@ def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
 
 
 def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
-    """Yield an arena's meshes, textures and materials, with floor and wall textures from LIBERO's code."""
     chosen = {"texplane": arena.floor, "tex-wall": arena.wall}
     for element in room.iterfind("asset/texture"):
         if element.get("name") in chosen:
@@ -321,12 +317,10 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         clear_radius=known.clear if contains else 0.0,
         round=known.round,
         upright=upright,
-        glow=(f"{name}_{GLOW}",) if class_name in GLOW_SITES else (),
     )
 
 
 def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
-    """Return grasps between opposite sides of a box, the narrower first."""
     x, y, z = (np.add(low, high) / 2).tolist()
     centre = (x, y, max(z, high[2] - GRASP_DEPTH))
     widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
@@ -391,7 +385,6 @@ def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
 def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
-    """Add the spring from a fixed point near the path of a point of the moving part to that point."""
     travel, press = DEAD_CENTRE[articulation.kind], _DETENT_FORCE[articulation.kind]
     lever = 1.0 if articulation.kind == "drawer" else DETENT_LEVER
     reach = travel * lever

@@ -21,7 +21,7 @@ from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
-from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
+from lerobot_memobench.sim.scene import AGENTVIEW, GLOW, GLOW_OFF, GLOW_ON, GLOW_SITES, Scene, get_scene
 from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -166,7 +166,7 @@ class Simulation:
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        self._glowing = [(asset, geom) for asset in scene.assets.values() for geom in asset.glow]
+        self._glowing = [name for name, asset in scene.assets.items() if asset.class_name in GLOW_SITES]
 
     # --- life -----------------------------------------------------------------------------------------------
 
@@ -257,7 +257,11 @@ class Simulation:
         self._controller.advance(self.data, float(action[6]))
         self._check_physics(time)
         if self._hidden.absent:
-            self._update_hidden()
+            ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
+            revealed = self._hidden.reveal(ajar)
+            self._hidden.park()
+            mujoco.mj_step1(self.model, self.data)
+            self._start.mark_objects(revealed)
         closing = action[6] > 0.0  # closing the hand leaves the detent
         self.caught_at_home = False
         if self._at_home is not None and self._begun is not None and not closing and self._start.in_detent():
@@ -266,13 +270,6 @@ class Simulation:
                 self._put_back(self._begun)
             else:
                 self._put_back(self._at_home, arm_only=True)
-
-    def _update_hidden(self) -> None:
-        ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
-        revealed = self._hidden.reveal(ajar)
-        self._hidden.park()
-        mujoco.mj_step1(self.model, self.data)
-        self._start.mark_objects(revealed)
 
     def _check_physics(self, time: float) -> None:
         """Raise for MuJoCo's warnings; without the check it silently continues from the model's initial state."""
@@ -400,9 +397,9 @@ class Simulation:
 
         fine = self.render_settings.quality == HIGH
         with self._rasterizer(2 if fine else 1) as (rasterizer, model, data):
-            for asset, geom in self._glowing:
-                lit = self.holds(Atom("turnon", (asset.name,)))
-                model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
+            for name in self._glowing:
+                lit = self.holds(Atom("turnon", (name,)))
+                model.geom(f"{name}_{GLOW}").rgba = GLOW_ON if lit else GLOW_OFF
             image = rasterizer.draw(model, data, _mjcf_camera(camera), self.highlights)
         return mean_of_four(image) if fine else image
 

@@ -162,7 +162,6 @@ class World:
         return on_table or self.touching(a, self._owner_of(region))
 
     def _box_of(self, region: str) -> tuple[Array, Array, Array]:
-        """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
         if site < 0:
             regions = [self._model.site(i).name for i in range(self._model.nsite)]
@@ -303,7 +302,6 @@ class StartState:
         return near and level and bool(np.all(np.abs(opening - self._opening) <= DETENT_OPENING))
 
     def _hand(self) -> tuple[Array, Array, Array]:
-        """Return position (3,) and rotation (3, 3) of the grip site, and finger positions (2,)."""
         data = self._data
         rotation = data.site_xmat[self._grip].reshape(3, 3).copy()
         return data.site_xpos[self._grip].copy(), rotation, data.qpos[robot.FINGERS].copy()

@@ -218,6 +218,5 @@ def asks_order(goal: Formula) -> bool:
 
 
 def _out_of_order(first_steps: Sequence[int | None]) -> bool:
-    """Return whether a checkpoint was satisfied before, or without, an earlier one."""
     reached = [step for step in first_steps if step is not None]
     return reached != sorted(reached) or None in first_steps[: len(reached)]

@@ -226,7 +226,7 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
     root = _parse(text, str(path))
     name, sections = _sections(root)
     items = {key: sections[key].sequence(key)[1:] if key in sections else [] for key in _SECTIONS}
-    names = _Names()
+    names: dict[str, tuple[str, str]] = {}
     problem = Problem(
         name=name,
         domain="",
@@ -238,13 +238,13 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
         init=(),
         goal=And(()),
     )
-    targets = names.spelling()
+    targets = {key: name for key, (_, name) in names.items()}
     for node in items[":regions"]:
         region, fault = _region(node, targets)
         if fault is not None:
             problem.unplaced[region] = fault
             continue
-        names.declare(node, region.full_name, "the region")
+        _declare(names, node, region.full_name, "the region")
         problem.regions[region.full_name] = region
     # These refer to the declarations, so they are parsed last.
     if ":domain" in sections and len(items[":domain"]) != 1:
@@ -254,7 +254,7 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
     return replace(
         problem,
         domain=items[":domain"][0].text("a domain name") if items[":domain"] else "",
-        objects_of_interest=tuple(names.declared(node) for node in items[":obj_of_interest"]),
+        objects_of_interest=tuple(_declared(names, node) for node in items[":obj_of_interest"]),
         goal=_formula(problem, items[":goal"][0]),
         init=_init(problem, sections[":init"]),
     )
@@ -289,32 +289,23 @@ def _language(text: str, section: _Node) -> str:
     return language
 
 
-class _Names:
-    """Case-insensitive registry of declared names; rejects names that differ only in case."""
-
-    def __init__(self) -> None:
-        self._kinds: dict[str, tuple[str, str]] = {}
-
-    def declare(self, node: _Node, name: str, kind: str) -> None:
-        """Add a name; ``kind`` describes it in the error for a second declaration."""
-        if name.lower() in self._kinds:
-            first = " ".join(self._kinds[name.lower()])
-            raise node.error(f"the name {name!r} declared again", f"another name, because {first} exists")
-        self._kinds[name.lower()] = (kind, name)
-
-    def spelling(self) -> dict[str, str]:
-        """Return lower-case name -> declared name."""
-        return {key: name for key, (_, name) in self._kinds.items()}
-
-    def declared(self, node: _Node) -> str:
-        """Return the declared spelling of a name of interest."""
-        known, name = self.spelling(), node.text("a declared name")
-        if name.lower() not in known:
-            raise node.error(f"{name!r} in :obj_of_interest", f"a declared name, {nearest(name, known.values())}")
-        return known[name.lower()]
+def _declare(names: dict[str, tuple[str, str]], node: _Node, name: str, kind: str) -> None:
+    """Add a name to {lower case: (kind, name)}; ``kind`` describes it in the error for a second declaration."""
+    if name.lower() in names:
+        first = " ".join(names[name.lower()])
+        raise node.error(f"the name {name!r} declared again", f"another name, because {first} exists")
+    names[name.lower()] = kind, name
 
 
-def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
+def _declared(names: dict[str, tuple[str, str]], node: _Node) -> str:
+    name = node.text("a declared name")
+    if name.lower() not in names:
+        known = [known for _, known in names.values()]
+        raise node.error(f"{name!r} in :obj_of_interest", f"a declared name, {nearest(name, known)}")
+    return names[name.lower()][1]
+
+
+def _declarations(nodes: list[_Node], names: dict[str, tuple[str, str]]) -> dict[str, str]:
     """Parse ``a b - class c - class`` into {instance: class}."""
     expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
     declared: dict[str, str] = {}
@@ -330,7 +321,7 @@ def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
             lacking = "a class after it" if waiting else "a name before it"
             raise node.error(f"a '-' without {lacking}", expected)
         for name in waiting:
-            names.declare(name, name.word, f"the {class_name}")
+            _declare(names, name, name.word, f"the {class_name}")
             declared[name.word] = class_name
         waiting = []
     if waiting:
@@ -339,7 +330,6 @@ def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
 
 
 def _region(node: _Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
-    """Return a region, and the error message for an undeclared target."""
     items = node.sequence(_REGION)
     if not items:
         raise node.error("an empty list ()", _REGION)

@@ -203,7 +203,6 @@ def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
 
 
 def _numbered(word: str, names: list[str], suite: str, listing: str) -> list[str]:
-    """Return the tasks of a number, or of an inclusive range of numbers."""
     numbers, lowest = re.fullmatch(r"(\d+)(?:-(\d+))?", word), _first_number(suite)
     first, last = (-1, -1) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
     if not lowest <= first <= last < lowest + len(names):

@@ -252,7 +252,6 @@ def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula
 
 
 def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[Any]]:
-    """Return the operator of a JSON object and its operands."""
     if len(value) != 1:
         raise MemobenchError(f"{where}: found an object with {len(value)} keys, expected one of {_KEYS}")
     ((head, rest),) = value.items()

@@ -89,7 +89,6 @@ def _subtask(text: str, before: str) -> str:
 
 
 def _expand_first_match(patterns: Sequence[tuple[str, str]], text: str) -> str:
-    """Return the expansion of the first matching pattern, else the text unchanged."""
     for pattern, template in patterns:
         match = re.fullmatch(pattern, text)
         if match:

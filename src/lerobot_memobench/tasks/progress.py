@@ -143,8 +143,6 @@ class _HoldNode(_Node):
 
 
 class _ExactlyNode(_Node):
-    """True while the part has had ``number`` rising edges; the count saturates at one more."""
-
     count, before = 0, False
 
     def value(self, read: Read) -> bool:
@@ -165,8 +163,6 @@ class _ExactlyNode(_Node):
 
 
 class _ThenNode(_Node):
-    """Count how long the current child has held; evaluate the next child from the following step."""
-
     done, held = 0, 0
 
     def value(self, read: Read) -> bool:
@@ -201,8 +197,6 @@ class _RoundNode(_Node):
 
 
 class _WhenNode(_Node):
-    """Latch the second part's value in the first step in which the first part is true."""
-
     decided: bool | None = None
 
     def value(self, read: Read) -> bool:
