@@ -94,17 +94,14 @@ def counts_events(formula: Formula) -> bool:
 
 
 def plan_of(formula: Formula) -> list[Step]:
-    """Return the steps that make a formula true, in order.
-
-    Steps shared by parts of an ``And`` are planned once, for example if one part counts all rounds and another the
-    rounds that begin at home.
-    """
+    """Return the steps that make a formula true, in order."""
     match formula:
         case Atom():
             return [] if formula.predicate in _PASSIVE_PREDICATES else [formula]
         case Not() | Never():
             return []
         case And(parts):
+            # Shared steps are planned once: one part may count all rounds, and another those that begin at home.
             return _merge_plans([plan_of(part) for part in sorted(parts, key=_rank)])
         case Or(parts):
             return plan_of(parts[0])
@@ -155,10 +152,7 @@ class Expert:
         """Whether the goal held at the last call of `act`."""
 
     def act(self) -> NDArray[np.float32]:
-        """Return the action (7,) for the present state; after the plan come to rest with open fingers.
-
-        Call once per control step: each call advances the plan.
-        """
+        """Return the action (7,) for the present state, and advance the plan; after it come to rest, fingers open."""
         if self._started:
             # Track latches and order: present atoms alone do not determine the goal.
             self.succeeded, *_ = self._evaluator.step(self.sim.holds)
@@ -227,8 +221,7 @@ class Expert:
                 raise MemobenchError(f"the expert has no motion for {atom}")
 
     def _place_until_holds(self, atom: Atom, once: Callable[[], Steps]) -> Steps:
-        """Pick and place until the atom holds: an object may slip, or lean on a drawer's wall."""
-        for _ in range(MAX_TRIES):
+        for _ in range(MAX_TRIES):  # an object may slip, or lean on a drawer's wall
             yield from once()
             if self._holds(atom) and not (atom.predicate == "in" and protrudes_from_drawer(self.hand, *atom.args)):
                 return
@@ -275,14 +268,12 @@ class Expert:
 
 
 def blind_routine(task: Task, sim: Simulation, rng: np.random.Generator) -> Steps:
-    """Reach a published task's goal, return home and repeat, forever: a baseline without memory.
+    """Reach a published task's goal, return to the first pose and repeat, forever: a baseline without memory.
 
-    No state is kept between rounds, so the routine cannot count. It ignores prompt and instruction, and so hidden and
-    indicated objects. ``task``: for a strict task the one it is derived from. The hand's pose at the first action is
-    home.
+    It ignores prompt and instruction. ``task``: for a strict task the one it is derived from.
     """
     home = sim.eef_pose()
-    while True:
+    while True:  # no state is kept between rounds, so the routine cannot count
         expert = Expert(task, sim, rng)
         while not expert.done:
             yield expert.act()

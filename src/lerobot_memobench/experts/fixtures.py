@@ -179,7 +179,7 @@ def close_drawer(hand: Hand, region: str) -> Steps:
 
 
 def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Array:
-    """Return the displacement (3,) along a handle at which the hand, 20 cm wide, pushes with the least collision, m."""
+    # The hand is 20 cm wide along the handle.
     handle, _ = hand.sim.site_pose(articulation.handle_site)
 
     def collision(aside: float) -> float:

@@ -116,12 +116,9 @@ def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
 
 
 def _closing_of_fallen(hand: Hand, name: str) -> float:
-    """Return the closing angle for an object that lies on its side: across its narrower horizontal extent, rad.
-
-    In a drawer close along the front: the hand is 20 cm wide and would otherwise collide with the cabinet.
-    """
+    """Return the closing angle for an object that lies on its side: across its narrower horizontal extent, rad."""
     drawer = drawer_containing(hand, name)
-    if drawer is not None:
+    if drawer is not None:  # along the front: across it the hand, 20 cm wide, would collide with the cabinet
         out = opening_direction(hand, hand.sim.world.articulation(drawer)[0])
         return float(np.arctan2(out[0], -out[1]))
     _, rotation = hand.sim.asset_pose(name)
@@ -150,9 +147,7 @@ class _Approach:
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site at an opening of the fingers; default: the present.
 
-        A rim is grasped with the inner finger close to the wall at every opening: the hand approaches from outside and
-        follows the outer finger while closing, so the bowl's content is not touched. The hand leans away from
-        obstacles, and towards the base if the object or its destination is distant.
+        The hand leans away from obstacles, and towards the base if the object or its destination is distant.
         """
         hand, name, grasp = self.hand, self.name, self.grasp
         opening = hand.sim.gripper_opening() if opening is None else opening
@@ -161,6 +156,8 @@ class _Approach:
         target = position + spun @ np.asarray(grasp.position)
         outward = None
         if _is_rim(hand, name, grasp):
+            # The inner finger is close to the wall at every opening: the hand approaches from outside and follows the
+            # outer finger while closing, so the bowl's content is not touched.
             outward = spun[:, 0] * np.sign(grasp.position[0])
             over = grasp.position[2] - FINGER_REACH - hand.sim.assets[name].supports
             gap = float(np.clip(RIM_GAP_SLOPE * over, MIN_RIM_GAP, MAX_RIM_GAP))
@@ -267,12 +264,11 @@ def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
 
 
 def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
-    """Return the grasps of a flat box off its middle: towards an end, towards one side, or both.
-
-    They leave room for the hand, or for a finger, between the box and an obstacle. A taller box would tip over.
-    """
+    """Return the grasps of a flat box off its middle: towards an end, towards one side, or both."""
+    # They leave room for the hand, or for a finger, between the box and an obstacle.
     grasps = []
     for grasp in asset.grasps:
+        # A taller box would tip over.
         if grasp.symmetric or not asset.top - asset.bottom < grasp.width < WIDE_GRASP:
             continue
         across = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw)])
@@ -314,13 +310,10 @@ def _cost(approach: _Approach, avoid: Array | None) -> float:
 def pick(
     hand: Hand, name: str, avoid: Array | None = None, place: Array | None = None
 ) -> Generator[NDArray[np.float32], None, Held | None]:
-    """Grasp an object from above and lift it; retry failed grasps with other candidates.
+    """Grasp and lift an object; return it with its pose in the hand, None if all attempts failed.
 
-    Return the object with its pose in the hand, None if all attempts failed.
-
-    Args:
-        avoid: horizontal direction (3,) along which the fingers should not close, because of the destination.
-        place: destination of the object's origin (3,), m; distant destinations need other grasps.
+    ``avoid``: horizontal direction (3,) along which the fingers should not close, because of the destination.
+    ``place``: destination of the object's origin (3,), m; distant destinations need other grasps.
     """
     failed = 0
     for attempt in range(MAX_ATTEMPTS):
@@ -376,11 +369,8 @@ def carry(
 ) -> Steps:
     """Move the held object's origin above a destination (3,) and lower it; stop early if it is dropped.
 
-    Args:
-        destination: returns the present target of the object's origin (3,), m.
-        turn: rotation (3, 3) of the hand on arrival.
-        clearance, tolerance: height of the approach above the destination, and tolerance of the origin, m.
-        support: ignored as an obstacle.
+    ``turn``: rotation (3, 3) of the hand on arrival. ``clearance``: height of the approach above the destination, m.
+    ``support``: ignored as an obstacle.
     """
 
     def at(height: float) -> Target:

@@ -84,10 +84,8 @@ NEUTRAL_CLOSING = np.array([-0.5, np.sqrt(0.75), 0.0])
 
 
 def downward(yaw: float) -> Array:
-    """Return the rotation (3, 3) of a downward hand that closes along the horizontal angle ``yaw``, rad.
-
-    A parallel gripper is symmetric: of the two orientations choose the one farther from the last joint's limits.
-    """
+    """Return the rotation (3, 3) of a downward hand that closes along the horizontal angle ``yaw``, rad."""
+    # A parallel gripper is symmetric: of the two orientations choose the one farther from the last joint's limits.
     closing = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return frame(DOWN, closing if closing @ NEUTRAL_CLOSING >= 0 else -closing)
 

@@ -105,13 +105,10 @@ def protrudes_from_drawer(hand: Hand, name: str, region: str) -> bool:
 
 
 def region_box(hand: Hand, region: str) -> tuple[Array, Array, Array]:
-    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, with the third axis up.
-
-    The site frames of LIBERO's drawers have another axis up.
-    """
+    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, with the third axis up."""
     centre, rotation = hand.sim.site_pose(region)
     half = hand.sim.site_half_size(region)
-    upright = int(np.argmax(np.abs(rotation[2])))
+    upright = int(np.argmax(np.abs(rotation[2])))  # another axis in the site frames of LIBERO's drawers
     if upright == 2:
         return centre, rotation, half
     order = [(upright + 1) % 3, (upright + 2) % 3, upright]
@@ -290,11 +287,8 @@ def is_held(hand: Hand, held: Held) -> bool:
 
 
 def sustained(reached: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a condition, evaluated once per step, that is true after ``reached`` has held for `PRESS_STEPS` steps.
-
-    A policy that imitates the motion less exactly and stops some steps earlier still closes the joint.
-    """
-    count = 0
+    """Return a condition, evaluated once per step, that is true after ``reached`` has held for `PRESS_STEPS` steps."""
+    count = 0  # a policy that imitates the motion less exactly and stops some steps earlier still closes the joint
 
     def condition() -> bool:
         nonlocal count
@@ -354,10 +348,8 @@ def release_fixture(hand: Hand, height: float = 0.12) -> Steps:
 
 
 def release_object(hand: Hand, up: float = 0.12) -> Steps:
-    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it.
-
-    Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
-    """
+    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it."""
+    # Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
     grip = hand.sim.gripper_opening()
     yield from hand.open(3)
     for _ in range(MAX_RELEASE_STEPS):
@@ -375,10 +367,7 @@ def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
 
 
 def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
-    """Return to the home pose and come to rest there; a hand at home does not move.
-
-    Settling ends after `MAX_SETTLING_STEPS` steps.
-    """
+    """Return to the home pose and come to rest there; a hand at home does not move."""
     if hand.sim.holds(HAND_HOME):
         return
     yield from go_home(hand, position, rotation)

@@ -121,14 +121,7 @@ def _candidates() -> Iterator[tuple[str, Path]]:
 
 @cache
 def _verified(folder: Path) -> dict[str, Path]:
-    """Return name -> path of all LIBERO files of a folder, after comparing their hashes.
-
-    Hashing takes 0.1 to 0.4 s. A stamp in the folder of caches has a name that depends on inode, size and times of all
-    files; while it exists, the files are those of an earlier comparison.
-
-    Raises:
-        MemobenchError: naming the first file that is missing or has another content.
-    """
+    """Return name -> path of all LIBERO files of a folder; raise `MemobenchError` for a missing or changed one."""
     paths, versions = {name: folder / name for name in known_hashes()}, [*known_hashes().items()]
     try:
         for path in paths.values():
@@ -138,6 +131,7 @@ def _verified(folder: Path) -> dict[str, Path]:
             # Programs can set the time of modification, but not the time of the last change.
             times = state.st_mtime_ns, state.st_ctime_ns
             versions.append((str(path), repr((state.st_dev, state.st_ino, state.st_size, *times))))
+        # Hashing takes 0.1 to 0.4 s. While a stamp for inode, size and times of all files exists, they are unchanged.
         stamp = cache_folder() / "libero" / f"{hashlib.sha256(repr(versions).encode()).hexdigest()}.verified"
         if not stamp.exists():
             for name, path in paths.items():
@@ -152,11 +146,7 @@ def _verified(folder: Path) -> dict[str, Path]:
 
 
 def user_objects(built_in: Collection[str]) -> dict[str, Path]:
-    """Return class -> MJCF file, existing or not, of each folder in the user's folder of objects.
-
-    Raises:
-        MemobenchError: the user's folder does not exist, or contains a class in ``built_in``.
-    """
+    """Return class -> MJCF file, existing or not, of each folder in the user's folder; raise for ``built_in`` names."""
     setting = user_folders()[-1]
     if not setting:
         return {}
@@ -173,9 +163,6 @@ def scan(class_name: str) -> Path | None:
     """Return the MJCF file of a scan; None if the user has set no folder of scans, or it lacks an unknown class.
 
     The scans of a category are sorted by name: ``<category>`` is the first one, ``<category>__k`` the one with index k.
-
-    Raises:
-        MemobenchError: the folder or the scan does not exist.
     """
     setting = os.environ.get(SCANS_VARIABLE)
     if not setting:
@@ -230,10 +217,7 @@ def obtain() -> AssetsFolder:
 def copy_to(folder: Path) -> int:
     """Copy the files that scenes read, and their terms, into a folder; return their size, bytes.
 
-    Files with the right content stay, so the same call continues an interrupted one.
-
-    Raises:
-        MemobenchError: the folder has another file of a name, or no place has all files.
+    Files with the right content stay, so the same call continues an interrupted one; another file is an error.
     """
     source, size = check_assets(), 0
     for name, known in known_hashes().items():

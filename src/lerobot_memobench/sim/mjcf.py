@@ -66,13 +66,7 @@ def is_visual(element: ET.Element) -> bool:
 
 
 def class_file(class_name: str, suite: str) -> ClassFile:
-    """Return the content of a class's files: LIBERO's, this package's, the user's or a scan's.
-
-    Published tasks use the authors' scan if the user has it; strict tasks use this package's objects for all users.
-
-    Raises:
-        MemobenchError: the class is unknown, or its files are missing or have unexpected content.
-    """
+    """Return the content of a class's files: LIBERO's, this package's, the user's or a scan's."""
     own = own_objects()
     user_classes = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
     if class_name in ALL_CLASSES:
@@ -81,6 +75,7 @@ def class_file(class_name: str, suite: str) -> ClassFile:
         return _object_class(files.asset(mjcf), known.turns, posixpath.dirname(mjcf))
     if file_name(class_name, "the class of an object") in user_classes:
         return _user_class(user_classes[class_name])
+    # Published tasks use the authors' scan if the user has it; strict tasks are equal for all users.
     scan = files.scan(class_name) if suite != STRICT else None
     if scan is not None:
         return _scanned_class(scan)

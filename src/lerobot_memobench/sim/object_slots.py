@@ -77,11 +77,7 @@ class Thing:
 class ObjectSlots:
     """Compute object observations of one simulation.
 
-    Attributes:
-        things: all things of the scene: each object and fixture, followed by its moving parts.
-
-    Raises:
-        MemobenchError: the scene has more things than there are slots, or an unregistered class.
+    ``things``: all things of the scene: each object and fixture, followed by its moving parts.
     """
 
     def __init__(self, sim: Simulation) -> None:

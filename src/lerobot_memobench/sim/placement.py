@@ -40,11 +40,7 @@ Pose = NDArray[np.float64]
 
 
 class Placer:
-    """Place fixtures and objects of one simulation by the `init` atoms of its task.
-
-    Raises:
-        MemobenchError: an instance has no placing atom.
-    """
+    """Place fixtures and objects of one simulation by the `init` atoms of its task."""
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
@@ -59,12 +55,10 @@ class Placer:
     def place(self, seed: int, draw: int = 0) -> None:
         """Sample a placement of a seed and write it into model (fixtures) and data (objects, joints).
 
-        Of the scenes of a seed, only ``draw`` 0 is LIBERO's.
-
         Raises:
             MemobenchError: a region has no free space for its object.
         """
-        # The first one is the stream of LIBERO's own `np.random.seed`.
+        # Draw 0 is LIBERO's, the stream of its own `np.random.seed`.
         rng = np.random.RandomState([seed, draw] if draw else seed)
         rng.randn(7)
         joints = self._draw_joints(rng)
@@ -130,12 +124,10 @@ class Placer:
     # --- places ---
 
     def _draw(self, atom: Atom, poses: Mapping[str, Pose], rng: np.random.RandomState) -> Pose:
-        """Draw a free position and then the rotation for a placing atom.
-
-        LIBERO ignores overlaps of fixtures and of objects on objects.
-        """
+        """Draw a free position and then the rotation for a placing atom."""
         name, where = atom.args
         rectangles, base = self._room(atom, poses)
+        # LIBERO ignores overlaps of fixtures and of objects on objects.
         alone = self._assets[name].kind == "fixture" or where in self._assets
         obstacles = {} if alone else poses
         known, z = self._files[name], base[2] - self._files[name].bottom
@@ -150,11 +142,7 @@ class Placer:
         )
 
     def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
-        """Return the ranges of x and y, and their origin (3,) with the height of the underside.
-
-        On a fixture's region the range is half the region, reduced by the object's radius, by which some arenas reduce
-        all ranges. In regions and on objects the position is the centre.
-        """
+        """Return the ranges of x and y, and their origin (3,) with the height of the underside."""
         name, where = atom.args
         if where in self._assets:
             if where not in poses:
@@ -174,6 +162,7 @@ class Placer:
         base = owner[:3] + _single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
         if atom.predicate == "in":
             return [CENTRE_ONLY], base
+        # As in LIBERO, half the region, reduced by the object's radius.
         x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
 
@@ -199,15 +188,13 @@ def _quaternion(axis: str, angle: float) -> Array:
 
 
 def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> Array:
-    """Draw an object's quaternion (4,) as LIBERO.
-
-    LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
-    about z. Several rotations are multiplied in single precision.
-    """
+    """Draw an object's quaternion (4,) as LIBERO."""
+    # LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
+    # about z.
     drawn = [np.roll(_quaternion(axis, rng.uniform(low, high)), -1) for axis, low, high in turns]
     if len(drawn) == 1:
         return drawn[0]
-    q = np.array([0.0, 0.0, 0.0, 1.0])
+    q = np.array([0.0, 0.0, 0.0, 1.0])  # several rotations are multiplied in single precision
     for x1, y1, z1, w1 in drawn:
         x0, y0, z0, w0 = q
         q = np.array(

@@ -90,11 +90,7 @@ _scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
 
 
 def get_scene(task: Task) -> Scene:
-    """Return the compiled scene of a task, cached per process.
-
-    Raises:
-        MemobenchError: LIBERO's assets are missing or have unexpected content, or a class of the task is unknown.
-    """
+    """Return the compiled scene of a task, cached per process; raise `MemobenchError` for missing or unknown files."""
     key = task.name, task.suite, task.bddl_text, *user_folders()
     if key not in _scenes:
         _scenes[key] = _build_scene(task, key)
@@ -367,12 +363,10 @@ _DETENT_FORCE = {"drawer": 5.0, "door": 0.45, "knob": 0.15}
 
 
 def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
-    """Add to each drawer, door and knob a stop at its initial position and a spring that holds it there.
-
-    In the published scenes a drawer that was pushed closed is up to 5 mm deeper than an untouched one, and doors and
-    knobs rest where they are released, so images reveal past events. As in furniture, an over-centre spring near the
-    closed end presses the joint against its stop. Away from that end the spring is slack and motion is as published.
-    """
+    """Add to each drawer, door and knob a stop at its initial position and a spring that holds it there."""
+    # In the published scenes a drawer that was pushed closed is up to 5 mm deeper than an untouched one, and doors and
+    # knobs rest where they are released, so images reveal past events. As in furniture, an over-centre spring near the
+    # closed end presses the joint against its stop. Away from that end it is slack and motion is as published.
     for asset in assets.values():
         for articulation in asset.articulations.values():
             joint = spec.joint(articulation.joint)

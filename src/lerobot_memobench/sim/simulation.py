@@ -59,11 +59,7 @@ class UnstablePhysicsError(MemobenchError):
 
 
 def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
-    """Return an action as a finite array (7,).
-
-    Raises:
-        InvalidActionError: the action is not numeric, has another shape, or is not finite.
-    """
+    """Return an action as a finite array (7,); raise `InvalidActionError` for another."""
     try:
         array: NDArray[F] = np.asarray(action, dtype=dtype)
     except (TypeError, ValueError):  # text, ragged lists, tensors of another device
@@ -178,8 +174,7 @@ class Simulation:
     ) -> None:
         """Sample the initial state of a seed, or set a stored one, and run the stabilisation steps.
 
-        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation. A strict scene is drawn
-        again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
+        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation.
 
         Args:
             settling: called with `holds` after each stabilisation step.
@@ -193,6 +188,7 @@ class Simulation:
         """
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
+        # A strict scene is drawn again while an object is thrown or still moves after these steps.
         for draw in range(MAX_SCENES):
             self.settled = self._set_up(seed, draw, settling, state)
             if self.settled or not self._strict:
@@ -281,11 +277,9 @@ class Simulation:
             raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {warning}")
 
     def _put_back(self, start: Snapshot, arm_only: bool = False) -> None:
-        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller only.
-
-        Joint angles are restored, not only the hand's pose: the arm is redundant, and its configuration would reveal
-        its earlier motion.
-        """
+        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller only."""
+        # Joint angles, not only the hand's pose: the arm is redundant, and its configuration would reveal its earlier
+        # motion.
         time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
         absent = self._hidden.absent
         self.restore(start)
@@ -315,13 +309,9 @@ class Simulation:
         return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
 
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
-        """Set a recorded state for queries and rendering.
+        """Set a recorded state for queries and rendering; fixtures stay by default.
 
-        The previously set state counts as its predecessor (`StartState.mark_step`). Fixtures stay by default.
-
-        Raises:
-            MemobenchError: the state has another shape.
-            UnstablePhysicsError: MuJoCo reported a warning.
+        The previously set state counts as its predecessor (`StartState.mark_step`).
         """
         state = np.asarray(state, dtype=np.float64)
         if state.shape != (self.state_dim,):
@@ -368,16 +358,13 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
-        """Restore the state before a demonstration prompt, without the hidden objects.
-
-        Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
-        objects are absent until their drawers are ajar (`HiddenObjects`).
+        """Restore the state before a demonstration prompt, without the hidden objects (`HiddenObjects`).
 
         ``hidden``: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
         absent = tuple(self._hidden.describe(name, region) for name, region in hidden)
-        self.restore(start)
+        self.restore(start)  # bit for bit: a displaced bottle would reveal the hand's path
         self._hidden.absent = absent
         self._hidden.park()
         mujoco.mj_step1(self.model, self.data)
@@ -513,10 +500,8 @@ def _mjcf_camera(camera: str) -> str:
 
 
 def axis_angle(quaternion: Array) -> Array:
-    """Return the rotation vector (3,) of a quaternion wxyz, computed as in robosuite and openpi.
-
-    The sign of the quaternion is kept: the result is continuous through a half turn, unlike a canonical form.
-    """
+    """Return the rotation vector (3,) of a quaternion wxyz, computed as in robosuite and openpi."""
+    # The quaternion's sign is kept: the result is continuous through a half turn, unlike a canonical form.
     w = float(np.clip(quaternion[0], -1.0, 1.0))
     norm = np.sqrt(1.0 - w * w)
     if norm < 1e-8:

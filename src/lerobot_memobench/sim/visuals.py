@@ -121,10 +121,7 @@ def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
 
 
 def _thinned(shape: Triangles) -> Triangles:
-    """Return a simplified shape with preserved texture seams.
-
-    Collapsed vertices take texture coordinates and normal of the nearest original vertex.
-    """
+    """Return a simplified shape with preserved texture seams."""
     points, normals, uv, triangles = shape
     if len(triangles) <= THIN_ABOVE or not uv.any() or np.ptp(points, axis=0).max() > MAX_THINNED_SIZE:
         return shape
@@ -141,6 +138,7 @@ def _thinned(shape: Triangles) -> Triangles:
     corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
     if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
         return shape
+    # Collapsed vertices take texture coordinates and normal of the nearest original vertex.
     distance = np.linalg.norm(spots - corners[moved], axis=1)
     order = np.lexsort((-distance, moved))  # the nearest vertex of each is written last
     nearest = np.zeros(len(corners), np.int64)

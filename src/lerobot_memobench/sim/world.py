@@ -78,11 +78,7 @@ class World:
                 self.joints[f"{name}_{region}" if region else name] = (articulation, address)
 
     def holds(self, atom: Atom) -> bool:
-        """Return whether an atom is true now.
-
-        Raises:
-            MemobenchError: a name is not in the scene, or the predicate does not apply to it.
-        """
+        """Return whether an atom is true now; raise `MemobenchError` if the scene has no answer."""
         match atom.predicate:
             case "in":
                 return self._in(*atom.args)
@@ -134,9 +130,9 @@ class World:
         return holds
 
     def _in(self, a: str, region: str) -> bool:
-        """LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`."""
         self._index(a)
         point, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
+        # LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
         half = np.abs(rotation @ size)
         low, high = position - half, position + half
         low[2] -= IN_SLACK
@@ -158,8 +154,9 @@ class World:
         if not (above and np.all(np.abs(offset[:2]) < size[:2])):
             return False
         declared = self._task.regions.get(region)
-        on_table = declared is not None and declared.target not in self._instances
-        return on_table or self.touching(a, self._owner_of(region))
+        if declared is not None and declared.target not in self._instances:  # on the table no contact is needed
+            return True
+        return self.touching(a, max((name for name in self._instances if region.startswith(f"{name}_")), key=len))
 
     def _box_of(self, region: str) -> tuple[Array, Array, Array]:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
@@ -168,9 +165,6 @@ class World:
             raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, regions)}")
         data = self._data
         return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._model.site_size[site]
-
-    def _owner_of(self, region: str) -> str:
-        return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
 
 
 class StartState:
@@ -235,11 +229,7 @@ class StartState:
             self._turns[name] = self._data.xquat[self._bodies[name]].copy()
 
     def holds(self, atom: Atom) -> bool:
-        """Return whether an atom of `SINCE_START` is true now.
-
-        Raises:
-            MemobenchError: ``ajar`` of a name that has no joint.
-        """
+        """Return whether an atom of `SINCE_START` is true now."""
         match atom.predicate, atom.args:
             case "handhome", ():
                 return self._is_or_was_equal(self._arm, self._arm_indices)

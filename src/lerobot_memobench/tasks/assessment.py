@@ -54,8 +54,9 @@ def scene_and_variant(task: Task, episode: int) -> tuple[int, int]:
 def chance(task: Task) -> float | None:
     """Return the best success rate without memory: always choose the most frequent goal of the instruction.
 
-    None if the instruction determines the goal. Variants that differ in the other hidden object only share a goal.
+    None if the instruction determines the goal.
     """
+    # Variants that differ in the other hidden object only share a goal.
     goals: dict[str, Counter[Formula]] = {}
     for variant in _variants(task):
         goals.setdefault(variant.language, Counter())[variant.goal] += 1
@@ -187,29 +188,23 @@ def _spoilt(task: Task, first_steps: Sequence[int | None], lost: Formula) -> str
 
 
 def _memory_served(task: Task, first_steps: Sequence[int | None], ordered: bool) -> bool:
-    """Return whether a strict rollout did all that it had to remember, so that what is missing is the hand's.
-
-    Before the first event of an instruction there is nothing to remember; a hidden thing is where its drawer is opened.
-    """
+    """Return whether a strict rollout did all that it had to remember, so that the missing part is the hand's."""
     if task.suite != STRICT or task.memory_type not in ("temporal", "spatial"):
         return False
+    # Before the first event there is nothing to remember; a hidden thing is where its drawer is opened.
     return ordered or (first_steps[0] is None) == (task.memory_type == "temporal")
 
 
 def classify(
     operations: Sequence[str], first_steps: Sequence[int | None], success: bool, drift: bool = False
 ) -> str | None:
-    """Return the paper's class from the operation labels ("S", "U" or "C") of the checkpoints.
-
-    The first checkpoint that was never satisfied determines the class, unless a drift explains it. With all checkpoints
-    satisfied, the execution failed, not the memory.
-    """
+    """Return the paper's class from the operation labels ("S", "U" or "C") of the checkpoints."""
     if success:
         return None
     for operation, first_step in zip(operations, first_steps, strict=True):
         if first_step is None:
             return REFERENCE_DRIFT if drift else _BY_OPERATION[operation]
-    return "execution_failure"
+    return "execution_failure"  # with all checkpoints satisfied, the memory did not fail
 
 
 def asks_order(goal: Formula) -> bool:

@@ -102,11 +102,7 @@ class Problem:
         return [*self.objects, *self.fixtures, *self.regions]
 
     def resolve(self, formula: Formula, where: str) -> Formula:
-        """Return ``formula`` with names in their declared spelling.
-
-        Raises:
-            MemobenchError: a name is not declared, or its kind does not fit the predicate.
-        """
+        """Return ``formula`` with names in their declared spelling, each of a kind that fits its predicate."""
         declared = {name.lower(): name for name in self.names}
         spelling: dict[str, str] = {}
         for atom in atoms(formula):
@@ -187,10 +183,10 @@ class _Node:
 
 
 def _parse(text: str, path: str) -> _Node:
-    """Return the single top-level list. The parser is iterative, so deep nesting cannot overflow the stack."""
+    """Return the single top-level list."""
     top_level: list[_Node] = []
     root = _Node(path, line=1, start=0, items=top_level)
-    stack, line, last = [root], 1, 0
+    stack, line, last = [root], 1, 0  # no recursion, which deep nesting would overflow
     for match in re.finditer(r"[()]|[^\s()]+", text):
         line += text.count("\n", last, match.start())
         last = match.start()
@@ -216,11 +212,7 @@ def _parse(text: str, path: str) -> _Node:
 
 
 def parse_bddl(text: str, path: object = "<text>") -> Problem:
-    """Parse a BDDL problem; ``path`` appears in error messages only.
-
-    Raises:
-        MemobenchError: with file, line, the unexpected item and the expected one.
-    """
+    """Parse a BDDL problem; ``path`` is named in error messages."""
     # Replace comments by spaces to preserve offsets and line numbers.
     text = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
     root = _parse(text, str(path))

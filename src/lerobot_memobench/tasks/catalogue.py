@@ -97,7 +97,7 @@ def suite_of(name: str) -> str | None:
 
 
 def group_of(name: str) -> str:
-    """Return the memory type of a catalogue task, for a task of LIBERO its suite; raises as `task_folder`."""
+    """Return the memory type of a catalogue task, for a task of LIBERO its suite."""
     return _entry(name).group
 
 
@@ -139,17 +139,13 @@ def _first_number(suite: str) -> int:
 
 
 def task_folder(name: str) -> Path:
-    """Return the folder of a catalogue task, for a task of LIBERO its place in an archive; `load_task` reads both.
-
-    Raises:
-        MemobenchError: the name is unknown; the nearest names are given.
-    """
+    """Return the folder of a catalogue task, for a task of LIBERO its place in an archive; `load_task` reads both."""
     return _entry(name).folder
 
 
 @cache
 def get_task(name: str) -> Task:
-    """Return a catalogue task; raises as `task_folder`."""
+    """Return a catalogue task; raise `MemobenchError` with the nearest names for an unknown one."""
     entry = _entry(name)
     return _libero_task(entry) if entry.suite in LIBERO_SUITES else load_task(entry.folder)
 
@@ -480,13 +476,10 @@ def _infer_prompt(memory_type: MemoryType, problem: Problem, checkpoints: tuple[
 
 
 def _infer_referent(problem: Problem, checkpoints: tuple[Checkpoint, ...]) -> str | None:
-    """Return the prompt's object, from the first checkpoint that names objects, else from the goal.
-
-    Prefer the first object with siblings of its class, which could be confused, over the first object.
-    """
+    """Return the prompt's object, from the first checkpoint that names objects, else from the goal."""
     siblings = Counter(problem.objects.values())
     for formula in (*(checkpoint.goal for checkpoint in checkpoints), problem.goal):
         objects = [arg for atom in atoms(formula) for arg in atom.args if arg in problem.objects]
-        if objects:
+        if objects:  # prefer one with siblings of its class, which could be confused
             return next((arg for arg in objects if siblings[problem.objects[arg]] > 1), objects[0])
     return None

@@ -58,10 +58,8 @@ def referent_text(requested: str, drawn: bool) -> str:
 
 
 def horizon_of(difficulty: str) -> int:
-    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown.
-
-    As many per repetition as in the standard suite, and not less in all.
-    """
+    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown."""
+    # As many per repetition as in the standard suite, and not less in all.
     check_choice("difficulty", difficulty, DIFFICULTIES)
     return max(HORIZON, HORIZON * REPETITIONS[cast("Difficulty", difficulty)] // REPETITIONS[STANDARD])
 
