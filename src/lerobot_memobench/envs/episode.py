@@ -33,8 +33,7 @@ from lerobot_memobench.constants import (
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert, blind_routine
+from lerobot_memobench.experts.expert import Expert, PromptDemonstrator, blind_routine
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import (
     InvalidActionError,

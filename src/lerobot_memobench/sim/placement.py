@@ -66,7 +66,7 @@ class Placer:
         still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self._write({name: still for name, asset in self._assets.items() if asset.kind == "fixture"}, joints)
         poses: dict[str, Pose] = {}
-        for atom in self._in_order():
+        for atom in sorted(self._placing.values(), key=self._rank):
             poses[atom.args[0]] = self._draw(atom, poses, rng)
         self._write(poses, joints)
 
@@ -84,17 +84,13 @@ class Placer:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
 
-    def _in_order(self) -> list[Atom]:
-        """Return the placing atoms in LIBERO's order: on the table, on fixtures, in regions, on objects."""
-
-        def rank(atom: Atom) -> int:
-            if atom.args[1] in self._assets:
-                return 3
-            if atom.predicate == "in":
-                return 2
-            return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
-
-        return sorted(self._placing.values(), key=rank)
+    def _rank(self, atom: Atom) -> int:
+        """Return LIBERO's order of placing: on the table, on fixtures, in regions, on objects."""
+        if atom.args[1] in self._assets:
+            return 3
+        if atom.predicate == "in":
+            return 2
+        return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
 
     # --- joints ---
 

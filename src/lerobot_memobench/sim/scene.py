@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ET
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
 import mujoco
 import numpy as np
@@ -43,7 +42,7 @@ from lerobot_memobench.sim.asset import (
 )
 from lerobot_memobench.sim.files import user_folders
 from lerobot_memobench.sim.visuals import drawing_model
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import STANDARD, STRICT, Task
 from mujoco_raster.drawlist import DrawList
 
 Array = NDArray[np.float64]
@@ -70,12 +69,10 @@ CACHED_SCENES = 4
 """Compiled scenes cached per process, some MB each; evaluation runs tasks one after another."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled scene. The model is shared; modify copies only."""
 
-    key: tuple[str, ...]
-    """Identifies the scene in caches; variants of a task share it."""
     model: mujoco.MjModel
     """The simulated model, without visual geoms."""
     assets: dict[str, Asset]
@@ -86,21 +83,14 @@ class Scene:
     """Returns a visual model with equal bodies and joints, and its draw list."""
 
 
-_scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
-
-
 def get_scene(task: Task) -> Scene:
     """Return the compiled scene of a task, cached per process; raise `MemobenchError` for missing or unknown files."""
-    key = task.name, task.suite, task.bddl_text, *user_folders()
-    if key not in _scenes:
-        _scenes[key] = _build_scene(task, key)
-    _scenes.move_to_end(key)
-    while len(_scenes) > CACHED_SCENES:
-        _scenes.popitem(last=False)
-    return _scenes[key]
+    # Variants of a task share their scene, at each difficulty.
+    return _build_scene(task.variant(0).at(STANDARD), user_folders())
 
 
-def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
+@lru_cache(maxsize=CACHED_SCENES)
+def _build_scene(task: Task, _folders: tuple[str, ...]) -> Scene:
     with _naming(task):
         spec = scene_spec(task)
         model = spec.compile()
@@ -115,7 +105,7 @@ def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
         with _naming(task):
             return drawing_model(scene_spec(task, visuals=True))
 
-    return Scene(key, model, assets, tuple(sorted(set(missing))), drawing)
+    return Scene(model, assets, tuple(sorted(set(missing))), drawing)
 
 
 @contextlib.contextmanager

@@ -104,7 +104,7 @@ def get_rasterizer(scene: Scene, height: int, width: int) -> Rasterizer:
     """Return this thread's rasterizer of a scene, created on first use and shared by simulations of the scene."""
     from mujoco_raster.rasterizer import Rasterizer  # loads numba
 
-    key, cached = (scene.key, height, width), _cache.rasterizers
+    key, cached = (scene, height, width), _cache.rasterizers
     if key not in cached:
         while len(cached) >= CACHED_RASTERIZERS:
             cached.popitem(last=False)
