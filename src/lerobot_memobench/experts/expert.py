@@ -47,25 +47,18 @@ from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import STRICT, Task
 from mujoco_raster.highlights import Highlight
 
-MAX_TRIES = 3
-"""Attempts at placing an object or executing a step before the plan continues without it."""
+MAX_TRIES = 3  # attempts at placing an object or executing a step before the plan continues without it
 HOME_REST_STEPS = 10
 """Control steps at home between two events. Policies trained on a hand that turns around at home within one step learn
 to turn around before they reach it."""
-MAX_REPAIRS = 3
-"""Passes over the goal's atoms that do not hold at the end."""
-PAUSE_STEPS = 8
-"""Steps at rest before and after a prompt, so that it has a first and a last frame."""
+MAX_REPAIRS = 3  # passes over the goal's atoms that do not hold at the end
+PAUSE_STEPS = 8  # steps at rest before and after a prompt, so that it has a first and a last frame
 HIGHLIGHT_STEPS = 50
-HIDING_SPEED_FACTOR = 1.25
-"""Speed factor while hiding objects, so that two hidings fit into a prompt."""
-Step = Atom | Hold
-"""An atom to achieve, or a rest: a `Hold` whose child is already true."""
+HIDING_SPEED_FACTOR = 1.25  # speed factor while hiding objects, so that two hidings fit into a prompt
+Step = Atom | Hold  # an atom to achieve, or a rest: a `Hold` whose child is already true
 
-_PASSIVE_PREDICATES = ("inplace", "ajar", "lifted")
-"""Predicates without a motion."""
-_HOME_PREDICATES = ("handhome", "asbegun")
-"""Predicates achieved by returning home."""
+_PASSIVE_PREDICATES = ("inplace", "ajar", "lifted")  # predicates without a motion
+_HOME_PREDICATES = ("handhome", "asbegun")  # predicates achieved by returning home
 
 
 def steps_of(formula: Formula) -> list[Atom]:
@@ -171,7 +164,7 @@ class Expert:
             return np.clip(next(self._motion), -1.0, 1.0)
         except StopIteration:
             self.done = True
-        return self.hand.rest(OPEN)
+        return self.hand.rest()
 
     def _plan(self) -> Steps:
         if counts_events(self.task.goal):
@@ -188,7 +181,7 @@ class Expert:
             for atom in missing:
                 yield from self.achieve(atom)
         for _ in range(hold_steps_of(self.task.goal)):
-            yield self.hand.rest(OPEN)
+            yield self.hand.rest()
 
     def _run_step(self, step: Step) -> Steps:
         if isinstance(step, Hold):

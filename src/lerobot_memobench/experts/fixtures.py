@@ -41,8 +41,7 @@ from lerobot_memobench.experts.travel import (
 )
 from lerobot_memobench.sim.asset import Articulation
 
-HANDLE_TILT = np.radians(35)
-"""Downward tilt of the hand at a handle: the flange clears the table, rad."""
+HANDLE_TILT = np.radians(35)  # downward tilt of the hand at a handle: the flange clears the table, rad
 WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(30), np.radians(27)
 """Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With more roll or less tilt
 the hand touches the table below the lowest drawer, stays above the bar and slips off; with more tilt it touches the
@@ -50,32 +49,24 @@ handle above; with less roll the bar does not fit between the fingers."""
 HANDLE_APPROACH, HANDLE_MARGIN = (0.14, 0.07, 0.0), 0.03
 """Distances of the open fingers from a handle on the way to it, and the margin between the hand, which turns on this
 way, and objects in front of the handle, m."""
-DOWNWARD_REACH = 0.72
-"""Distance from the arm's base up to which a downward hand moves freely, m."""
+DOWNWARD_REACH = 0.72  # distance from the arm's base up to which a downward hand moves freely, m
 DOOR_THICKNESS = 0.02
 DOOR_EDGE_INSET, DOOR_EDGE_DEPTH = 0.012, 0.018
 """Grasp on a door's upper edge: distance from the handle towards the hinge, and depth, m."""
-SWING_LEAD = 0.13
-"""Angle by which the hand leads a door along its arc, rad."""
-SWING_END_LEAD = 0.04
-"""Lead at the end of the swing, rad; a faster hand would throw the door out of reach."""
-FREE_SWING_END_LEAD = 0.015
-"""Lead at the end of the swing of a door without friction, rad."""
-PUSH_GAP = 0.06
-"""Distance of the closed fingers in front of a handle before pushing, m."""
+SWING_LEAD = 0.13  # angle by which the hand leads a door along its arc, rad
+SWING_END_LEAD = 0.04  # lead at the end of the swing, rad; a faster hand would throw the door out of reach
+FREE_SWING_END_LEAD = 0.015  # lead at the end of the swing of a door without friction, rad
+PUSH_GAP = 0.06  # distance of the closed fingers in front of a handle before pushing, m
 PUSH_SIDES = (0.0, 0.02, -0.02, 0.04, -0.04, 0.06, -0.06)
 """Displacements along a handle at which a drawer is pushed, in the order of preference, m."""
-HANDLE_GRIP_DEPTH = 0.018
-"""Depth of the grasp below a handle's upper end, m."""
+HANDLE_GRIP_DEPTH = 0.018  # depth of the grasp below a handle's upper end, m
 
-SWEEP_LEAD = 0.16
-"""Angle by which the hand leads a door in one sweep, rad."""
+SWEEP_LEAD = 0.16  # angle by which the hand leads a door in one sweep, rad
 PANEL_PUSH_INSET, PANEL_PUSH_DEPTH = 0.045, 0.030
 """Contact point for pushing a door: distance from the handle towards the hinge, and depth below the upper edge, m."""
 PANEL_APPROACH_GAP, PANEL_CONTACT_GAP = 0.06, 0.018
 """Distance of the hand from the panel's centre plane before and during the push, m."""
-MAX_SWEEP_STEPS = 150
-"""Maximum number of control steps of a sweep."""
+MAX_SWEEP_STEPS = 150  # maximum number of control steps of a sweep
 
 
 def _joint_position(hand: Hand, name: str) -> float:

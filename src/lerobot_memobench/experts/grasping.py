@@ -54,38 +54,29 @@ from lerobot_memobench.experts.travel import (
 )
 from lerobot_memobench.sim.asset import TABLE_TOP, Asset, Grasp
 
-MAX_ATTEMPTS = 4
-"""Maximum attempts at grasping an object or moving a handle, door or knob."""
-LOW_GRASP_ATTEMPTS = 2
-"""Attempts before a tall object is grasped higher."""
-MAX_REACH_SHORTFALL = 0.04
-"""Largest shortfall of the arm's reach for which a low grasp is tried before higher ones, m."""
+MAX_ATTEMPTS = 4  # maximum attempts at grasping an object or moving a handle, door or knob
+LOW_GRASP_ATTEMPTS = 2  # attempts before a tall object is grasped higher
+MAX_REACH_SHORTFALL = 0.04  # largest shortfall of the arm's reach for which a low grasp is tried before higher ones, m
 RAISED_GRASP_OFFSET, MIN_DEPTH_BELOW_TOP = 0.02, 0.0122
 """Height offset of raised grasps, and smallest depth of the finger centre below the object's top, m."""
-FALLEN_COSINE = 0.7
-"""Cosine of the tilt below which an object lies on its side."""
-MAX_EXTRA_COST = 1.5
-"""Largest cost above the best grasp's of a candidate."""
+FALLEN_COSINE = 0.7  # cosine of the tilt below which an object lies on its side
+MAX_EXTRA_COST = 1.5  # largest cost above the best grasp's of a candidate
 SHIFTED_COST = 1.6
 """Cost of a shifted grasp, m; above `MAX_EXTRA_COST`, so that it is chosen only where the others are blocked."""
 FINGER_HALF_WIDTH, MIN_SIDE_GAP = 0.0105, 0.006
 """Half the width of a finger tip, and smallest gap between a box and the near finger at a shifted grasp, m."""
 FUNNEL_SLOPE, FUNNEL_RADIUS = 4.0, 0.006
 """Approach funnel: height per lateral distance beyond the radius, and the radius, m."""
-FUNNEL_CLEARANCE_SHARE = 0.6
-"""Share of the clearance between open fingers and object that limits the funnel's radius."""
+FUNNEL_CLEARANCE_SHARE = 0.6  # share of the clearance between open fingers and object that limits the funnel's radius
 GRASP_STALL_STEPS, GRASP_STALL_DISTANCE = 6, 0.015
 """Steps without progress after which the fingers close in place, and the largest distance to the grasp, m, for example
 on a plate's rim. Policies hardly learn a longer wait without visible change."""
-LIFT_HEIGHT = 0.10
-"""Height to which an object is lifted before transport, m."""
-HOVER_HEIGHT = 0.09
-"""Height above a grasp for aligning the hand, m."""
+LIFT_HEIGHT = 0.10  # height to which an object is lifted before transport, m
+HOVER_HEIGHT = 0.09  # height above a grasp for aligning the hand, m
 MIN_RIM_GAP, MAX_RIM_GAP = 0.004, 0.012
 """Smallest (plate) and largest (deep bowl) gap between a rim and the inner finger during descent, m. Policies need the
 gap because they localise the rim less exactly."""
-RIM_GAP_SLOPE = 0.7
-"""Gap per height of the finger above the container's floor."""
+RIM_GAP_SLOPE = 0.7  # gap per height of the finger above the container's floor
 CLOSING_LEAD = 0.03
 """Reduction of the present opening for targets while closing, because the arm lags behind the fingers, m."""
 MAX_RELEASE_OFFSET, LEVEL_COSINE = 0.03, 0.95
@@ -94,21 +85,16 @@ support."""
 MAX_DRAWER_OFFSET = 0.025
 """Largest distance from the target in a drawer at which an object is released, m; farther away it would lean on a
 wall."""
-MAX_TIPPING = 0.08
-"""Largest decrease of a bowl's upright cosine by grasping; a bowl pressed on its rim slips."""
-MAX_SINKING = 0.002
-"""Depth by which an object may sink into its support, m."""
+MAX_TIPPING = 0.08  # largest decrease of a bowl's upright cosine by grasping; a bowl pressed on its rim slips
+MAX_SINKING = 0.002  # depth by which an object may sink into its support, m
 FAR_SIDE_COST = 0.15
 """Cost of the rim's side opposite to the arm's base. Two sides are often equally good; policies trained on both average
 them and move to the middle."""
-WIDE_GRASP = 0.068
-"""Width from which a grasp is difficult, m."""
+WIDE_GRASP = 0.068  # width from which a grasp is difficult, m
 TIGHT_GRASP, TIGHT_GRASP_SPEED, TIGHT_COST = 0.074, 0.3, 1.5
 """Width from which a grasp leaves little room and the hand descends slowly, m; its speed, and cost in strict tasks."""
-MAX_RIM_LEAN = np.radians(14)
-"""Largest lean along a bowl's wall, rad."""
-MAX_RIGHTING_TILT = np.radians(35)
-"""Largest tilt of a held object that is corrected before placing, rad."""
+MAX_RIM_LEAN = np.radians(14)  # largest lean along a bowl's wall, rad
+MAX_RIGHTING_TILT = np.radians(35)  # largest tilt of a held object that is corrected before placing, rad
 
 
 def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:

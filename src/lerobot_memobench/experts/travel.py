@@ -25,47 +25,36 @@ from lerobot_memobench.sim.asset import TABLE_TOP, Articulation, Asset
 from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.tasks.formula import Atom
 
-DROP_DISTANCE = 0.05
-"""Displacement of a held object in the hand from which it counts as dropped, m."""
+DROP_DISTANCE = 0.05  # displacement of a held object in the hand from which it counts as dropped, m
 HAND_HOME = Atom("handhome", ())
-MAX_SETTLING_STEPS = 18
-"""Maximum number of control steps for settling at home."""
-HAND_HALF_WIDTH = 0.05
-"""Lateral extent of the hand in transit, m."""
+MAX_SETTLING_STEPS = 18  # maximum number of control steps for settling at home
+HAND_HALF_WIDTH = 0.05  # lateral extent of the hand in transit, m
 PRESS_STEPS = 2
 """Steps of pushing against a joint's stop. Fewer than the six steps a policy executes per plan; otherwise a policy that
 cannot observe the contact would plan them repeatedly."""
 RELEASE_GAP, MAX_RELEASE_STEPS = 0.004, 6
 """Increase of the finger opening at which an object is released, m, and largest number of steps waited for it."""
 
-FINGER_REACH = 0.0095
-"""Length of the finger tips below the grip site, m."""
-FINGER_THICKNESS = 0.014
-"""Thickness of a finger tip along the closing axis, m."""
-OPEN_WIDTH = 0.079
-"""Distance between the open fingers, m."""
+FINGER_REACH = 0.0095  # length of the finger tips below the grip site, m
+FINGER_THICKNESS = 0.014  # thickness of a finger tip along the closing axis, m
+OPEN_WIDTH = 0.079  # distance between the open fingers, m
 BLOCKED_DISTANCE, BLOCKED_COST = 0.010, 2.0
 """Horizontal distance between the centre of a finger tip and an object below which the finger collides with it, m, and
 the cost: policies would learn the failing grasp first."""
-HAND_MARGIN = 0.006
-"""Margin between the hand and other objects, m."""
+HAND_MARGIN = 0.006  # margin between the hand and other objects, m
 HAND_POINTS = np.array(
     [(x, y, -z) for x in (-0.1, -0.05, 0.0, 0.05, 0.1) for y in (-0.032, 0.0, 0.032) for z in (0.05, 0.08, 0.11)]
     + [(x, y, -z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.14, 0.18)]
     + [(x, y, -0.105) for x in (-0.02, 0.02) for y in (-0.045, 0.045)]  # rim of the flange
 )
 """Points on palm and wrist in the grip site's frame (N, 3), m."""
-MAX_DRAWER_EXCESS = 0.022
-"""Largest height by which an object may exceed a drawer's region without blocking it, m."""
-TRAVEL_CLEARANCE = 0.025
-"""Vertical clearance over obstacles, m."""
+MAX_DRAWER_EXCESS = 0.022  # largest height by which an object may exceed a drawer's region without blocking it, m
+TRAVEL_CLEARANCE = 0.025  # vertical clearance over obstacles, m
 
 OBSTACLE_DISTANCE = 0.085
 """Horizontal distance from the grip site within which a tall obstacle affects the hand's lean, m."""
-MAX_LEAN = np.radians(32)
-"""Largest lean for obstacle avoidance or reach, rad."""
-MAX_LEAN_UNDER = np.radians(44)
-"""Largest lean for objects below an obstacle, rad."""
+MAX_LEAN = np.radians(32)  # largest lean for obstacle avoidance or reach, rad
+MAX_LEAN_UNDER = np.radians(44)  # largest lean for objects below an obstacle, rad
 DRAWER_LEAN = np.radians(14)
 """Lean in the opening direction inside a drawer: avoids the handles above and the drawer's front, rad."""
 LEAN_CANDIDATES = (0.0, 0.12, -0.12, 0.24, -0.24, 0.36, -0.36, 0.48, -0.48)
@@ -347,7 +336,7 @@ def release_fixture(hand: Hand, height: float = 0.12) -> Steps:
     yield from hand.move(up, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
 
 
-def release_object(hand: Hand, up: float = 0.12) -> Steps:
+def release_object(hand: Hand) -> Steps:
     """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it."""
     # Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
     grip = hand.sim.gripper_opening()
@@ -356,7 +345,7 @@ def release_object(hand: Hand, up: float = 0.12) -> Steps:
         if hand.sim.gripper_opening() > grip + RELEASE_GAP:
             break
         yield from hand.open(1)
-    target = hand.position + up * UP
+    target = hand.position + 0.12 * UP
     yield from hand.move(target, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, speed=0.7, timeout=60)
 
 

@@ -22,18 +22,13 @@ from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.tasks.task import Task
 
 TABLE = "kitchen_table"
-TABLE_SIZE = (1.0, 1.2, 0.05)
-"""Size of the table's board, m."""
-TABLE_TOP = 0.90
-"""Height of the table's top, m; its centre is at x = y = 0."""
-COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4
-"""Groups of geoms with contacts, of drawn geoms, and of sites."""
+TABLE_SIZE = (1.0, 1.2, 0.05)  # size of the table's board, m
+TABLE_TOP = 0.90  # height of the table's top, m; its centre is at x = y = 0
+COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4  # groups of geoms with contacts, of drawn geoms, and of sites
 
-ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
-"""Yaws of a grasp whose fingers close along x or y of the body [rad]."""
+ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)  # yaws of a grasp whose fingers close along x or y of the body [rad]
 Triple = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-"""wxyz."""
+Quaternion = tuple[float, float, float, float]  # wxyz
 
 
 @dataclass(frozen=True)
@@ -147,14 +142,12 @@ def split_class(class_name: str) -> tuple[str, int]:
 
 # --- LIBERO's classes ---
 
-Turn = tuple[str, float, float]
-"""Axis (x, y or z), and the range of the angle, rad."""
+Turn = tuple[str, float, float]  # axis (x, y or z), and the range of the angle, rad
 UPRIGHT: Turn = ("x", 0.0, 0.0)
 QUARTER: Turn = ("x", pi / 2, pi / 2)
 BOTTLE: tuple[Turn, ...] = (QUARTER, ("z", pi / 2, pi / 2))
 SCANNED, GROCERY, MODELLED = "stable_scanned_objects", "stable_hope_objects", "turbosquid_objects"
-FIXTURE = "articulated_objects"
-"""Folders of MJCF files below the assets folder."""
+FIXTURE = "articulated_objects"  # folders of MJCF files below the assets folder
 
 
 @dataclass(frozen=True)
@@ -194,8 +187,7 @@ def _bowl(radius: float, height: float, width: float, *, floor: float, clear: fl
     return LiberoClass(SCANNED, grasps=(rim,), floor=floor, clear=clear, round=True)
 
 
-_DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
-"""Drawer -> height of its handle, m."""
+_DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}  # drawer -> height of its handle, m
 
 
 def _drawer(level: str, height: float) -> Articulation:
@@ -297,16 +289,14 @@ SUITE_CLASSES: dict[str, LiberoClass] = {
 }
 """Classes of LIBERO's own suites only, which object observations do not contain."""
 ALL_CLASSES = CLASSES | SUITE_CLASSES
-UNKNOWN_CLASS = LiberoClass("")
-"""A scan or a user's class; only its bounding box is known."""
+UNKNOWN_CLASS = LiberoClass("")  # a scan or a user's class; only its bounding box is known
 
 
 # --- arenas ---
 
 AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
 AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
-AGENTVIEW_ANGLE = 45.0
-"""Vertical field of view of the agentview camera, degrees."""
+AGENTVIEW_ANGLE = 45.0  # vertical field of view of the agentview camera, degrees
 LOW_VIEW = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
 """Quaternion wxyz of the agentview camera in the arenas without a mount."""
 

@@ -26,10 +26,8 @@ from lerobot_memobench.sim.asset import split_class
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
 """Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders, or
 with a LIBERO checkout."""
-SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
-"""Environment variable with the authors' folder `new_objects`."""
-OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
-"""Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
+SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"  # environment variable with the authors' folder `new_objects`
+OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"  # environment variable with the user's folder of objects, `<class>/<class>.xml`
 OWN_OBJECTS = Path(__file__).with_name("objects")
 """Folder of this package's objects of the scanned classes, in LIBERO's layout."""
 REPOSITORY = "lerobot/libero-assets"

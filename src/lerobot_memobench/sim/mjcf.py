@@ -25,8 +25,7 @@ from lerobot_memobench.tasks.task import STRICT
 from lerobot_memobench.untrusted import refusing
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
-REFERENCES = ("mesh", "material", "texture")
-"""Attributes that reference an asset."""
+REFERENCES = ("mesh", "material", "texture")  # attributes that reference an asset
 USER_TAGS = ("mujoco", "asset", "mesh", "texture", "material", "worldbody", "body", "geom", "site")
 """Elements of a user's object file."""
 SIZE_SITES = ("bottom_site", "top_site", "horizontal_radius_site")

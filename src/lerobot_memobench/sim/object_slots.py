@@ -29,8 +29,7 @@ from lerobot_memobench.sim.placement import quaternion_matrix
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from mujoco_raster.highlights import Highlight
 
-POINTS_PER_THING = 24
-"""Ray targets per thing."""
+POINTS_PER_THING = 24  # ray targets per thing
 POSE_RESOLUTION = 1e-4
 """Resolution of poses, m and rad. A drawer with content rests a nanometre from an empty one; without rounding the
 difference would reveal the content or change the order of slots."""

@@ -14,8 +14,7 @@ import numpy as np
 
 from mujoco_raster.compiled import compiled
 
-KP, NULLSPACE_KP = 150.0, 10.0
-"""Gains of the published, critically damped controller."""
+KP, NULLSPACE_KP = 150.0, 10.0  # gains of the published, critically damped controller
 KD, NULLSPACE_KD = float(2 * np.sqrt(KP)), float(2 * np.sqrt(NULLSPACE_KP))
 
 exact = partial(compiled, fastmath=False)

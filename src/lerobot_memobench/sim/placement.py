@@ -24,19 +24,14 @@ from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-MAX_DRAWS = 5000
-"""Maximum number of draws of a position."""
-MODEL_LOADS = 2
-"""Number of times LIBERO loads the model until the end of the first reset."""
-OBJECT_DROP_HEIGHT = 0.01
-"""Initial height of an object above the table or another object, m."""
+MAX_DRAWS = 5000  # maximum number of draws of a position
+MODEL_LOADS = 2  # number of times LIBERO loads the model until the end of the first reset
+OBJECT_DROP_HEIGHT = 0.01  # initial height of an object above the table or another object, m
 
 Array = NDArray[np.float64]
-Rectangle = tuple[float, float, float, float]
-"""x1, y1, x2, y2, m."""
+Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, m
 CENTRE_ONLY: Rectangle = (0.0, 0.0, 0.0, 0.0)
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
+Pose = NDArray[np.float64]  # position and quaternion wxyz, (7,)
 
 
 class Placer:

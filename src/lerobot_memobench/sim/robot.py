@@ -18,14 +18,12 @@ from lerobot_memobench.constants import CONTROL_HZ
 
 Array = NDArray[np.float64]
 
-FOLDER = Path(__file__).with_name("panda")
-"""Folder of the arm's MJCF and meshes."""
+FOLDER = Path(__file__).with_name("panda")  # folder of the arm's MJCF and meshes
 BASE_POSITION = (-0.66, 0.0, 0.0)
 """Base of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
 ARM_START = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4)
 """Joint angles at reset, rad (LIBERO's mounted Panda)."""
-GRIPPER_START = (0.020833, -0.020833)
-"""Finger positions at reset, m."""
+GRIPPER_START = (0.020833, -0.020833)  # finger positions at reset, m
 GRIPPER_OPEN = (0.04, -0.04)
 """Finger positions of the open hand, m. Opening fingers approach them for seconds; strict episodes start there, so that
 the finger positions do not reveal the time since they were closed."""
@@ -39,18 +37,14 @@ WRIST_CAMERA = "robot0_eye_in_hand"
 
 PHYSICS_STEP = 0.002
 SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
-POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
-"""Metres and radians per unit of action."""
-CLOSING_SIGNS = np.array([-1.0, 1.0])
-"""Signs of the finger commands that close the gripper."""
-GRIPPER_SPEED = 0.01
-"""Change of the gripper command (−1 open … 1 closed) per physics step."""
+POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5  # metres and radians per unit of action
+CLOSING_SIGNS = np.array([-1.0, 1.0])  # signs of the finger commands that close the gripper
+GRIPPER_SPEED = 0.01  # change of the gripper command (−1 open … 1 closed) per physics step
 
 MUJOCO = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
 FULLM_READS_DATA = MUJOCO >= (3, 10)
 """`mujoco.mj_fullM` takes (model, data, result); before MuJoCo 3.10 it took (model, result, data.qM)."""
-FULL_DEPTH_SINCE = (3, 4)
-"""First version of MuJoCo that reports the full depth of contacts between boxes."""
+FULL_DEPTH_SINCE = (3, 4)  # first version of MuJoCo that reports the full depth of contacts between boxes
 
 
 @cache

@@ -51,22 +51,16 @@ AGENTVIEW = "agentview"
 ARENA_BYTES = 32 * 2**20
 """Memory for contacts and constraints of one simulation. robosuite's files reserve it for 5,000 contacts, 1.3 GB; no
 scene uses 1 MB."""
-ZONE_HALF_HEIGHT = 0.007
-"""Half height of the site of a table region, m."""
+ZONE_HALF_HEIGHT = 0.007  # half height of the site of a table region, m
 FREE_DAMPING = "0.0005"
-GLOW_SITES = {"flat_stove": "burner"}
-"""Class -> site that LIBERO shows while an instance is on."""
-GLOW = "glow"
-"""Suffix of the name of the geom that replaces the site."""
+GLOW_SITES = {"flat_stove": "burner"}  # class -> site that LIBERO shows while an instance is on
+GLOW = "glow"  # suffix of the name of the geom that replaces the site
 GLOW_ON, GLOW_OFF = (0.9, 0.05, 0.05, 1.0), (0.9, 0.05, 0.05, 0.0)
 Y_UP = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
 """Rotation from the frame with z up to that of a body with y up, quaternion wxyz."""
-GRASP_DEPTH = 0.032
-"""Depth of a grasp below an object's top, m; fingers reach 4 cm below the palm."""
-MAX_GRASP_WIDTH = 0.068
-"""Largest width of a grasp, m."""
-CACHED_SCENES = 4
-"""Compiled scenes cached per process, some MB each; evaluation runs tasks one after another."""
+GRASP_DEPTH = 0.032  # depth of a grasp below an object's top, m; fingers reach 4 cm below the palm
+MAX_GRASP_WIDTH = 0.068  # largest width of a grasp, m
+CACHED_SCENES = 4  # compiled scenes cached per process, some MB each; evaluation runs tasks one after another
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,8 +332,7 @@ def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tup
 
 # --- detents ---
 
-DETENT_LEVER = 0.05
-"""Distance from a hinge to the spring's moving end, m."""
+DETENT_LEVER = 0.05  # distance from a hinge to the spring's moving end, m
 DETENT_OFFSET, DETENT_SLACK = 0.5, 2.5
 """Distance from the spring's fixed end to the path of the moving end, and the spring's rest length, in units of the
 distance from dead centre to the closed end."""

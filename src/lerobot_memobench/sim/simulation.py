@@ -38,16 +38,12 @@ MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
 STABILISATION_STEPS = 10  # objects start 1 to 8 cm above the table and fall in these steps
 SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
 """Largest horizontal shift of an object while a scene settles, m, and largest speed after it, m/s or rad/s."""
-MAX_SCENES = 200
-"""Maximum number of draws of a strict scene."""
-NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-"""No motion, gripper open."""
+MAX_SCENES = 200  # maximum number of draws of a strict scene
+NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # no motion, gripper open
 
 DEFAULT, HIGH = "default", "high"
-QUALITIES = (DEFAULT, HIGH)
-"""``high`` is for figures and videos: a pixel is the mean of four, at four times the cost."""
-CACHED_RASTERIZERS = 4
-"""Rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB."""
+QUALITIES = (DEFAULT, HIGH)  # ``high`` is for figures and videos: a pixel is the mean of four, at four times the cost
+CACHED_RASTERIZERS = 4  # rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB
 
 
 class InvalidActionError(MemobenchError):

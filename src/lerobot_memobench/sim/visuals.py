@@ -24,17 +24,14 @@ from mujoco_raster.textures import LAYER_SIZE, pixels_of, resized
 
 Arrays = Mapping[str, NDArray[Any]]
 """Cached content of a file: a NumPy record, which loads in a third of the time of an archive."""
-CACHE_FORMAT = "8"
-"""Version of the cache files; increase it with each change of their content."""
+CACHE_FORMAT = "8"  # version of the cache files; increase it with each change of their content
 MESH_SETTINGS = ("scale", "refpos", "refquat", "smoothnormal", "inertia")
 TEXTURE_SETTINGS = ("type", "hflip", "vflip", "nchannel", "gridsize", "gridlayout")
 """Attributes of a file's mesh or texture on which cached content depends."""
 THIN_ABOVE, THIN_TO = 6000, 4000
 """Number of triangles above which meshes are simplified, and the target; an object covers a thousandth of an image."""
-MAX_THINNED_SIZE = 0.5
-"""Largest size of simplified meshes, m; larger ones are static and drawn once per scene."""
-MIN_NORMAL_COSINE = 0.96
-"""Smallest cosine between vertex and face normal of a smooth corner of a simplified mesh."""
+MAX_THINNED_SIZE = 0.5  # largest size of simplified meshes, m; larger ones are static and drawn once per scene
+MIN_NORMAL_COSINE = 0.96  # smallest cosine between vertex and face normal of a smooth corner of a simplified mesh
 PLACEHOLDER_POINTS = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
 PLACEHOLDER_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Box placeholder of a mesh; the compiler does not change its frame."""

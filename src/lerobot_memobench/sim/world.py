@@ -24,17 +24,14 @@ from lerobot_memobench.tasks.task import Task
 
 Array = NDArray[np.float64]
 
-ON_DISTANCE = 0.03
-"""Horizontal distance of origins below which one object counts as on another, m."""
-IN_SLACK = 0.01
-"""Distance below a region's lower bound at which an origin still counts as inside, m."""
+ON_DISTANCE = 0.03  # horizontal distance of origins below which one object counts as on another, m
+IN_SLACK = 0.01  # distance below a region's lower bound at which an origin still counts as inside, m
 ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
 """Distances below and above a site's top between which an origin counts as on it, m."""
 
 DETENT_DISTANCE = 0.02
 """Largest distance of the grip site from home for the detent, m; twice the error of learned policies."""
-DETENT_ANGLE = 0.1
-"""Largest rotation of the hand from home for the detent, rad."""
+DETENT_ANGLE = 0.1  # largest rotation of the hand from home for the detent, rad
 DETENT_OPENING = 0.01
 """Largest distance of each finger from home for the detent, m; excludes a hand that holds an object."""
 DETENT_SPEED = (0.03, 0.15)
@@ -43,10 +40,8 @@ the detent in one step."""
 SAME_STATE = 1e-4
 """Largest difference of positions and velocities (m, rad, m/s, rad/s) between equal states; states in files are
 rounded."""
-PLACE_DISTANCE = 0.01
-"""Largest distance of an object in place from its start, m; two pixels."""
-LIFTED_HEIGHT = 0.02
-"""Height above its start from which an object is lifted, m; more than a push raises it."""
+PLACE_DISTANCE = 0.01  # largest distance of an object in place from its start, m; two pixels
+LIFTED_HEIGHT = 0.02  # height above its start from which an object is lifted, m; more than a push raises it
 DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
 """Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 

@@ -17,12 +17,10 @@ from lerobot_memobench.tasks.formula import Atom, Formula, Never, Round, Then, W
 from lerobot_memobench.tasks.progress import Evaluator
 from lerobot_memobench.tasks.task import HAND, MISCOUNT, STRICT, Task
 
-REFERENCE_DRIFT = "reference_drift"
-"""The policy acted on a wrong referent."""
+REFERENCE_DRIFT = "reference_drift"  # the policy acted on a wrong referent
 WRONG_ORDER = "wrong_order"
 """The steps of a procedure, or the events of an ordering task, were done in another order than asked for."""
-CUT_OFF = "cut_off"
-"""A horizon below the protocol's ended the rollout; its memory is not assessed."""
+CUT_OFF = "cut_off"  # a horizon below the protocol's ended the rollout; its memory is not assessed
 
 #: Failure classes of the published tasks, in the order of the report.
 FAILURES = (
@@ -36,8 +34,7 @@ FAILURES = (
 REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)
 
 INVALID_ACTION, UNSTABLE_PHYSICS = "invalid_action", "unstable_physics"
-FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)
-"""Classes of aborted rollouts, which do not assess memory."""
+FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)  # classes of aborted rollouts, which do not assess memory
 
 _BY_OPERATION = {"S": "storage_failure", "U": "stale_memory", "C": "compression_collapse"}
 

@@ -329,8 +329,7 @@ def _measured_cues() -> dict[str, list[tuple[int, int, int] | None]]:
 
 # --- LIBERO's suites ---
 
-NUM_STATES = 50
-"""Initial states of each of LIBERO's tasks; episode i starts in state i."""
+NUM_STATES = 50  # initial states of each of LIBERO's tasks; episode i starts in state i
 STEP_LIMITS: dict[LiberoSuite, int] = {
     "libero_spatial": 280,
     "libero_object": 280,

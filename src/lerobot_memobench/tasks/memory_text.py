@@ -14,8 +14,7 @@ from itertools import pairwise
 from lerobot_memobench.tasks.task import DEFAULT_LEVEL, Task
 
 SEPARATOR = "; "
-MARK = " Memory: "
-"""Separator between instruction and memory text in a prompt."""
+MARK = " Memory: "  # separator between instruction and memory text in a prompt
 NOTHING_YET = "nothing yet"
 
 

@@ -37,8 +37,7 @@ AS_BEGUN = Atom("asbegun", ())
 
 # --- operators over time ---
 
-Read = Callable[[Atom], bool]
-"""Returns the value of an atom in the present step, including latched atoms."""
+Read = Callable[[Atom], bool]  # returns the value of an atom in the present step, including latched atoms
 
 
 class _Node:
