@@ -150,8 +150,7 @@ class Expert:
         self.done = False
         """Whether the goal holds or the plan has ended. `act` may still be called and continues the present motion,
         because policies trained on it cannot observe the step in which the goal becomes true."""
-        self.succeeded = False
-        """Whether the goal held at the last call of `act`."""
+        self.succeeded = False  # whether the goal held at the last call of `act`
 
     def act(self) -> NDArray[np.float32]:
         """Return the action (7,) for the present state, and advance the plan; after it come to rest, fingers open."""
@@ -296,8 +295,7 @@ class PromptDemonstrator:
         self._task, self._sim, self._rng = task, sim, rng
         self._prompt = task.prompt
         self._referent = task.prompt.target or ""
-        self.succeeded = False
-        """Whether the last prompt succeeded, for example whether a routine reached its goal."""
+        self.succeeded = False  # whether the last prompt succeeded, for example whether a routine reached its goal
 
     def actions(self) -> Iterator[NDArray[np.float32]]:
         """Yield the actions (7,) of the prompt, one per control step."""

@@ -91,10 +91,8 @@ class _HandleGrip:
 
     hand: Hand
     articulation: Articulation
-    tilt: float
-    """Downward tilt, rad."""
-    roll: float = 0.0
-    """Roll about the fingers, rad."""
+    tilt: float  # downward tilt, rad
+    roll: float = 0.0  # roll about the fingers, rad
 
     def pose(self, back: float = 0.0) -> tuple[Array, Array]:
         """Return the position (3,) at a distance back from the handle along the fingers, m, and the rotation (3, 3)."""
@@ -258,12 +256,9 @@ class Door:
 
     q: float
     handle: Array
-    outward: Array
-    """Normal of the door's front."""
-    along: Array
-    """Direction from the hinge to the free edge."""
-    edge: Array
-    """Point on the upper edge near the handle, at the panel's centre plane."""
+    outward: Array  # normal of the door's front
+    along: Array  # direction from the hinge to the free edge
+    edge: Array  # point on the upper edge near the handle, at the panel's centre plane
 
 
 def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:

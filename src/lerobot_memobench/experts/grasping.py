@@ -123,12 +123,9 @@ class _Approach:
     name: str
     grasp: Grasp
     spin: float
-    place: Array | None
-    """Destination of the object's origin (3,), m."""
-    reaching: bool
-    """Whether reaching has priority over avoiding obstacles."""
-    shifted: bool
-    """Whether the grasp is one of `_shifted_grasps`, at which the hand may lean further."""
+    place: Array | None  # destination of the object's origin (3,), m
+    reaching: bool  # whether reaching has priority over avoiding obstacles
+    shifted: bool  # whether the grasp is one of `_shifted_grasps`, at which the hand may lean further
 
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site at an opening of the fingers; default: the present.

@@ -85,10 +85,8 @@ class Hand:
         self.sim, self.rng = sim, rng
         self.strict = sim.task.suite == STRICT
         """Whether the task is strict; published tasks keep the motions of their published demonstrations."""
-        self.speed = float(rng.uniform(0.62, 0.82))
-        """Largest linear action of this episode; 1 is about 0.25 m/s."""
-        self.slew = float(rng.uniform(0.16, 0.22))
-        """Largest change of an action's component per step."""
+        self.speed = float(rng.uniform(0.62, 0.82))  # largest linear action of this episode; 1 is about 0.25 m/s
+        self.slew = float(rng.uniform(0.16, 0.22))  # largest change of an action's component per step
         self._last: Array = np.zeros(6)
 
     @property

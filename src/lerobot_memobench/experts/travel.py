@@ -262,10 +262,8 @@ class Held:
     """A grasped object and its pose in the hand."""
 
     name: str
-    offset: Array
-    """Origin of the object in the hand's frame, (3,), m."""
-    turn: Array
-    """Rotation of the object in the hand's frame, (3, 3)."""
+    offset: Array  # origin of the object in the hand's frame, (3,), m
+    turn: Array  # rotation of the object in the hand's frame, (3, 3)
 
 
 def is_held(hand: Hand, held: Held) -> bool:

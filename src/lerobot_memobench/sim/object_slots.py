@@ -61,16 +61,11 @@ _NORMALS_ARGUMENT = (None,) if "normal:" in str(mujoco.mj_multiRay.__doc__) else
 class Thing:
     """An object, a fixture, or a moving part of a fixture."""
 
-    kind: int
-    """Index of its class."""
-    body: int
-    """Id of the body that defines its pose."""
-    joint: int | None
-    """Address of its joint in qpos, None without one."""
-    site: int | None
-    """Id of the site that defines its position, None for the body's."""
-    ordered_by: int
-    """Id of the body whose position sorts it."""
+    kind: int  # index of its class
+    body: int  # id of the body that defines its pose
+    joint: int | None  # address of its joint in qpos, None without one
+    site: int | None  # id of the site that defines its position, None for the body's
+    ordered_by: int  # id of the body whose position sorts it
 
 
 class ObjectSlots:

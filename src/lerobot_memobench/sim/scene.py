@@ -67,10 +67,8 @@ CACHED_SCENES = 4  # compiled scenes cached per process, some MB each; evaluatio
 class Scene:
     """A compiled scene. The model is shared; modify copies only."""
 
-    model: mujoco.MjModel
-    """The simulated model, without visual geoms."""
-    assets: dict[str, Asset]
-    """Instance name -> asset: objects, then fixtures without the table."""
+    model: mujoco.MjModel  # the simulated model, without visual geoms
+    assets: dict[str, Asset]  # instance name -> asset: objects, then fixtures without the table
     stand_ins: tuple[str, ...]
     """Published tasks: classes drawn by this package's objects because the paper's scans are not installed."""
     drawing: Callable[[], tuple[mujoco.MjModel, DrawList]]

@@ -117,10 +117,8 @@ class Snapshot:
     goal_position: Array
     goal_rotation: Array
     gripper: Array
-    goes_on: bool
-    """Whether the state continues its predecessor (`StartState.mark_step`)."""
-    hidden: tuple[HiddenObject, ...] = ()
-    """Objects outside the scene."""
+    goes_on: bool  # whether the state continues its predecessor (`StartState.mark_step`)
+    hidden: tuple[HiddenObject, ...] = ()  # objects outside the scene
 
 
 class Simulation:
@@ -146,8 +144,7 @@ class Simulation:
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
-        self.caught_at_home = False
-        """Whether the detent at home caught the hand in the last step."""
+        self.caught_at_home = False  # whether the detent at home caught the hand in the last step
         self.settled = True
         """Whether objects rested where they were placed after `reset`. Some of LIBERO's placements do not."""
         self._begun: Snapshot | None = None

@@ -303,12 +303,9 @@ class HiddenObject:
     """An absent object."""
 
     name: str
-    region: str
-    """Region of its drawer."""
-    offset: Array
-    """Position relative to the region's site, (3,), m."""
-    quaternion: Array
-    """Orientation wxyz (4,)."""
+    region: str  # region of its drawer
+    offset: Array  # position relative to the region's site, (3,), m
+    quaternion: Array  # orientation wxyz (4,)
 
 
 class HiddenObjects:
@@ -321,8 +318,7 @@ class HiddenObjects:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
-        self.absent: tuple[HiddenObject, ...] = ()
-        """Objects that are parked."""
+        self.absent: tuple[HiddenObject, ...] = ()  # objects that are parked
 
     def describe(self, name: str, region: str) -> HiddenObject:
         """Return an object that rests in a drawer, with its present pose relative to the drawer."""
