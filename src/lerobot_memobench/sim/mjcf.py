@@ -34,24 +34,15 @@ GUIDE = "docs/develop/add_an_object_class.md"
 
 @dataclass(frozen=True)
 class ClassFile:
-    """Content of a class's files. Do not modify its elements.
+    """Content of a class's files. Do not modify its elements."""
 
-    Attributes:
-        body: root body with default classes resolved.
-        assets: returns meshes, textures and materials with absolute file paths.
-        radius: horizontal radius that must be free of other objects, m.
-        bottom, top: heights of underside and top above the origin, m.
-        turns: initial rotations, applied in order.
-        stand_in: whether this package's object replaces a missing scan.
-    """
-
-    body: ET.Element
-    assets: Callable[[], list[ET.Element]]
-    radius: float
-    bottom: float
+    body: ET.Element  # root body with default classes resolved
+    assets: Callable[[], list[ET.Element]]  # returns meshes, textures and materials with absolute file paths
+    radius: float  # horizontal radius that must be free of other objects, m
+    bottom: float  # height of the underside above the origin, m
     top: float
-    turns: tuple[Turn, ...]
-    stand_in: bool = False
+    turns: tuple[Turn, ...]  # initial rotations, applied in order
+    stand_in: bool = False  # whether this package's object replaces a missing scan
 
     @property
     def collides_by_mesh(self) -> bool:

@@ -51,19 +51,12 @@ _KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
 
 @dataclass(frozen=True)
 class Region:
-    """A named place on ``target``.
+    """A named place on ``target``, a fixture or object."""
 
-    Attributes:
-        name: inside the file; atoms use ``full_name``.
-        target: fixture (or object) that carries the region.
-        ranges: rectangles (x1, y1, x2, y2) relative to the target's centre, m; empty for a site of the target.
-        yaw: interval (low, high) of the initial yaw, rad.
-    """
-
-    name: str
+    name: str  # inside the file; atoms use ``full_name``
     target: str
-    ranges: tuple[tuple[float, float, float, float], ...] = ()
-    yaw: tuple[float, float] = (0.0, 0.0)
+    ranges: tuple[tuple[float, float, float, float], ...] = ()  # (x1, y1, x2, y2) from its centre, m; () for a site
+    yaw: tuple[float, float] = (0.0, 0.0)  # interval (low, high) of the initial yaw, rad
 
     @property
     def full_name(self) -> str:
@@ -73,11 +66,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Problem:
-    """A parsed BDDL file; names in ``init`` and ``goal`` are declared. Mappings keep the file's order.
-
-    Attributes:
-        unplaced: region on an undeclared target -> error message for atoms that use it.
-    """
+    """A parsed BDDL file; names in ``init`` and ``goal`` are declared. Mappings keep the file's order."""
 
     name: str
     domain: str
@@ -88,7 +77,7 @@ class Problem:
     objects_of_interest: tuple[str, ...]
     init: tuple[Atom, ...]
     goal: Formula
-    unplaced: dict[Region, str] = field(default_factory=dict)
+    unplaced: dict[Region, str] = field(default_factory=dict)  # on an undeclared target -> error of atoms that use it
 
     @property
     def scene(self) -> dict[str, Any]:
