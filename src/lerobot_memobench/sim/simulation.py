@@ -79,12 +79,6 @@ class RenderSettings:
     width: int = 256
     quality: str = DEFAULT
 
-    def __post_init__(self) -> None:
-        if self.quality not in QUALITIES:
-            raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
-        if self.height < 1 or self.width < 1:
-            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; use sizes of 1 or more")
-
 
 class _RasterizerCache(threading.local):
     """Rasterizers of a thread, by scene and size; one serves one thread at a time."""

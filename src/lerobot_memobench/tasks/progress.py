@@ -81,25 +81,20 @@ class _AtomNode(_Node):
 
 
 class _AndNode(_Node):
+    deciding = False  # value of a part that decides the whole
+
     def value(self, read: Read) -> bool:
         values = [part.value(read) for part in self.parts]
-        return all(values)
+        return (self.deciding in values) == self.deciding
 
     @property
     def settled(self) -> bool | None:
         values = [part.settled for part in self.parts]
-        return False if False in values else None if None in values else True
+        return self.deciding if self.deciding in values else None if None in values else not self.deciding
 
 
-class _OrNode(_Node):
-    def value(self, read: Read) -> bool:
-        values = [part.value(read) for part in self.parts]
-        return any(values)
-
-    @property
-    def settled(self) -> bool | None:
-        values = [part.settled for part in self.parts]
-        return True if True in values else None if None in values else False
+class _OrNode(_AndNode):
+    deciding = True
 
 
 class _NotNode(_Node):
@@ -285,17 +280,7 @@ class Evaluator:
 class Progress:
     """Track the execution phase of one episode; call ``step`` exactly once per control step.
 
-    With two ``evaluations`` per control step, each part of `Then` has to hold for five steps.
-
-    Attributes (steps count from 1, None before the event; K checkpoints):
-        steps: control steps taken.
-        success: whether the goal holds now.
-        event: whether an event was completed in this step: a `Round` from any scene, of any variant's goal.
-        satisfied: (K,) whether the checkpoint's predicate holds now.
-        first_step: (K,) first step at which the predicate held.
-        ordered_step: (K,) first step at which it held after all earlier checkpoints were completed in order; several
-            may complete in one step.
-        index: number of checkpoints completed in order.
+    Steps count from 1. With two ``evaluations`` per control step, each part of `Then` has to hold for five steps.
     """
 
     def __init__(self, task: Task, evaluations: int = 1) -> None:
@@ -307,11 +292,13 @@ class Progress:
         self._evaluator = Evaluator([*goals, *events])
         count = len(task.checkpoints)
         self.steps = 0
-        self.success = self.event = False
-        self.satisfied: tuple[bool, ...] = (False,) * count
-        self.first_step: list[int | None] = [None] * count
+        self.success = False  # whether the goal holds now
+        self.event = False  # whether a round from any scene, of any variant's goal, was completed in this step
+        self.satisfied: tuple[bool, ...] = (False,) * count  # whether each checkpoint's predicate holds now
+        self.first_step: list[int | None] = [None] * count  # step at which the predicate first held
+        # Step at which it first held after all earlier checkpoints; several may complete in one step.
         self.ordered_step: list[int | None] = [None] * count
-        self.index = 0
+        self.index = 0  # number of checkpoints completed in order
 
     @property
     def broken(self) -> Formula | None:
