@@ -352,13 +352,8 @@ def _libero_task(entry: _Entry) -> Task:
         family=suite,
         language=" ".join(words[scenes[0] + 1 :] if name[0].isupper() and scenes else words),
         **parse_bddl(text, f"{entry.folder}.bddl").scene,
-        checkpoints=(),
-        prompt=None,
-        variants=(),
-        demo_summary="",
         folder=entry.folder,
         bddl_text=text,
-        metadata={},
         suite=suite,
     )
 

@@ -153,13 +153,13 @@ class Task:
     init: tuple[Atom, ...]
     objects_of_interest: tuple[str, ...]
     goal: Formula
-    checkpoints: tuple[Checkpoint, ...]
-    prompt: Prompt | None
-    variants: tuple[Variant, ...]
-    demo_summary: str
     folder: Path
     bddl_text: str = field(repr=False)
-    metadata: dict[str, Any] = field(repr=False)
+    metadata: dict[str, Any] = field(default_factory=dict, repr=False)
+    checkpoints: tuple[Checkpoint, ...] = ()
+    prompt: Prompt | None = None
+    variants: tuple[Variant, ...] = ()
+    demo_summary: str = ""
     variant_index: int = 0
     published: Task | None = field(default=None, repr=False)
     suite: Suite | LiberoSuite = "published"
