@@ -126,7 +126,10 @@ class Placer:
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             position = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
             if all(_is_clear_of(known, position, self._files[obstacle], obstacles[obstacle]) for obstacle in obstacles):
-                return np.array([*position, *self._turn(name, where, rng)])
+                if self._assets[name].kind == "fixture":
+                    low, high = sorted(self._task.regions[where].yaw)
+                    return np.array([*position, *_quaternion("z", rng.uniform(low, high))])
+                return np.array([*position, *sample_orientation(known.turns, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "
             "position; move the regions of its :init apart"
@@ -156,12 +159,6 @@ class Placer:
         # As in LIBERO, half the region, reduced by the object's radius.
         x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
-
-    def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
-        if self._assets[name].kind == "fixture":
-            low, high = sorted(self._task.regions[where].yaw)
-            return _quaternion("z", rng.uniform(low, high))
-        return sample_orientation(self._files[name].turns, rng)
 
 
 def _is_clear_of(thing: ClassFile, position: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:

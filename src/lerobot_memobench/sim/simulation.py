@@ -165,17 +165,12 @@ class Simulation:
 
         Args:
             settling: called with `holds` after each stabilisation step.
-            state: initial state (state_dim,) of arm, objects and joints, as of `tasks.catalogue`. The seed then
-                draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
-                and ``set_init_state`` do.
-
-        Raises:
-            MemobenchError: the state has another shape, or each of `MAX_SCENES` draws of a strict scene has such an
-                object.
+            state: initial state (state_dim,), as of `catalogue.initial_states`. The seed then draws the poses of the
+                fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset`` and ``set_init_state``.
         """
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
-        # A strict scene is drawn again while an object is thrown or still moves after these steps.
+        # A strict scene is drawn again while an object is thrown or still moves after the stabilisation.
         for draw in range(MAX_SCENES):
             self.settled = self._set_up(seed, draw, settling, state)
             if self.settled or not self._strict:

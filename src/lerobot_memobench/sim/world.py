@@ -59,12 +59,11 @@ class World:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
-        self._instances = {name: index for index, name in enumerate(assets)}
-        self._table = len(self._instances)
+        self._index = {name: index for index, name in enumerate([*assets, TABLE])}
         # Owner of each geom: the instance at the root of its body's tree, −1 for robot and room.
-        roots = {model.body(name).id: index for name, index in self._instances.items()}
+        roots = {model.body(name).id: self._index[name] for name in assets}
         self._owner = np.array([roots.get(int(root), -1) for root in model.body_rootid[model.geom_bodyid]])
-        self._owner[[model.geom(geom).name.startswith(TABLE) for geom in range(model.ngeom)]] = self._table
+        self._owner[[model.geom(geom).name.startswith(TABLE) for geom in range(model.ngeom)]] = self._index[TABLE]
         self._owner[model.geom_group != COLLISION_GROUP] = -1
         self.joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
@@ -79,7 +78,7 @@ class World:
                 return self._in(*atom.args)
             case "on":
                 a, b = atom.args
-                return self._on_object(a, b) if b in self._instances else self._on_site(a, b)
+                return self._on_object(a, b) if b in self._assets else self._on_site(a, b)
             case "open" | "close" | "turnon" | "turnoff":
                 return self._articulated(atom.predicate, atom.args[0])
         raise MemobenchError(
@@ -88,7 +87,7 @@ class World:
 
     def touching(self, a: str, b: str) -> bool:
         """Return whether two instances (or an instance and the table) are in contact."""
-        pair = {self._index(a), self._index(b)}
+        pair = {self._index[a], self._index[b]}
         if self._data.ncon == 0:
             return False
         owners = self._owner[self._data.contact.geom]
@@ -103,15 +102,6 @@ class World:
         articulation, address = self.joints[name]
         return articulation, float(self._data.qpos[address])
 
-    def _index(self, name: str) -> int:
-        if name == TABLE:
-            return self._table
-        if name not in self._instances:
-            raise MemobenchError(
-                f"task {self._task.name} has no object or fixture {name!r}; {nearest(name, self._instances)}"
-            )
-        return self._instances[name]
-
     def _articulated(self, predicate: str, name: str) -> bool:
         articulation, q = self.articulation(name)
         limit, holds = {
@@ -125,7 +115,6 @@ class World:
         return holds
 
     def _in(self, a: str, region: str) -> bool:
-        self._index(a)
         point, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
         # LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
         half = np.abs(rotation @ size)
@@ -134,14 +123,12 @@ class World:
         return bool(np.all(point > low) and np.all(point < high))
 
     def _on_object(self, a: str, b: str) -> bool:
-        self._index(a)
         above = self._data.body(a).xpos - self._data.body(b).xpos
         if above[2] < 0 or float(np.hypot(above[0], above[1])) >= ON_DISTANCE:
             return False
         return self.touching(a, b)
 
     def _on_site(self, a: str, region: str) -> bool:
-        self._index(a)
         position, rotation, size = self._box_of(region)
         # LIBERO applies the site's rotation where its inverse would be correct.
         offset = rotation @ (self._data.body(a).xpos - position)
@@ -149,9 +136,9 @@ class World:
         if not (above and np.all(np.abs(offset[:2]) < size[:2])):
             return False
         declared = self._task.regions.get(region)
-        if declared is not None and declared.target not in self._instances:  # on the table no contact is needed
+        if declared is not None and declared.target not in self._assets:  # on the table no contact is needed
             return True
-        return self.touching(a, max((name for name in self._instances if region.startswith(f"{name}_")), key=len))
+        return self.touching(a, max((name for name in self._assets if region.startswith(f"{name}_")), key=len))
 
     def _box_of(self, region: str) -> tuple[Array, Array, Array]:
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
