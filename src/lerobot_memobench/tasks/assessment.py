@@ -30,8 +30,7 @@ FAILURES = (
     REFERENCE_DRIFT,
     "execution_failure",
 )
-#: Classes in addition to the paper's; reports name those that occur.
-REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)
+REFINED_FAILURES = (WRONG_ORDER, CUT_OFF)  # classes in addition to the paper's; reports name those that occur
 
 INVALID_ACTION, UNSTABLE_PHYSICS = "invalid_action", "unstable_physics"
 FAULTS = (INVALID_ACTION, UNSTABLE_PHYSICS)  # classes of aborted rollouts, which do not assess memory

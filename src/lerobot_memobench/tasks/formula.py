@@ -35,11 +35,9 @@ LATCHES: dict[str, str] = {"wasopen": "open", "wasturnedon": "turnon"}
 #: Predicates that compare the present with the start of the execution; invalid in ``:init``.
 SINCE_START = frozenset({"handhome", "asbegun", "ajar", "inplace", "lifted"})
 
-#: Largest number in a formula: more steps than any episode has.
-MAX_NUMBER = 100_000
+MAX_NUMBER = 100_000  # largest number in a formula: more steps than any episode has
 
-#: Maximum nesting depth; bounds recursion on malformed files.
-MAX_DEPTH = 40
+MAX_DEPTH = 40  # maximum nesting depth; bounds recursion on malformed files
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,7 @@ REPETITIONS: dict[Difficulty, int] = {"easy": 2, "standard": 3, "hard": 5, "extr
 DIFFICULTIES = tuple(REPETITIONS)
 EASY, STANDARD = DIFFICULTIES[:2]
 REFERENTS = ("fixed", "random")
-#: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
-DRAWN = "drawn"
+DRAWN = "drawn"  # referent of strict episodes, which ignore the referent setting (`Task.drawn`)
 #: Control steps of a strict task's prompt per object shown, equal for all variants. The slowest of some 700 prompts
 #: used five sixths of them; the scene rests for the remainder.
 STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "pick": 300, "routine": 300, "hide": 600}
@@ -45,8 +44,7 @@ STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "p
 #: was searched in a wrong place; the events or the place were right, and the hand failed.
 MISCOUNT, WRONG_PLACE, HAND = STRICT_FAILURES = ("miscount", "wrong_place", "hand")
 LEVELS = ("coarse", "intermediate", "fine")
-#: Level of the evaluated operation labels (paper: intermediate).
-DEFAULT_LEVEL = 1
+DEFAULT_LEVEL = 1  # level of the evaluated operation labels (paper: intermediate)
 
 BDDL_FILE = "task_config.bddl"
 METADATA_FILE = "task_config.meta.json"
