@@ -178,7 +178,6 @@ def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Arr
 
 
 def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:
-
     def before(gap: float) -> Array:
         return hand.sim.site_pose(articulation.handle_site)[0] + gap * out + aside
 
@@ -273,10 +272,9 @@ def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     outward = outward if outward @ opening > 0 else -outward
     along = cross(UP, outward)
     along = along if along @ lever > 0 else -along
-    owner = max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
     depth = articulation.clearance + articulation.handle_size[1] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - DOOR_EDGE_INSET * along
-    edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
+    edge[2] = hand.sim.asset_pose(name)[0][2] + hand.sim.assets[name].top
     turned = Rotation.from_rotvec(joint.xaxis * ahead).apply
     handle, edge = hinge + turned(lever), hinge + turned(edge - hinge)
     return Door(q + ahead, handle, turned(outward), turned(along), edge)
