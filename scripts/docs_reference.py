@@ -461,7 +461,7 @@ def solved_by_routine() -> dict[str, float]:
 
 def without_memory(task: Any) -> dict[str, str]:
     """Return referent -> rate without a memory: routine or chance of a published task, ceiling of a strict one."""
-    from lerobot_memobench.tasks.evidence import chance
+    from lerobot_memobench.tasks.assessment import chance
     from research.necessity.adversaries import ceiling
 
     if task.suite == "strict":
@@ -494,15 +494,14 @@ PROMPTS = {
 
 def tasks_page(suite: str) -> str:
     """Return the list of a suite's tasks, with links to their cards."""
-    from lerobot_memobench.tasks.catalogue import get_task, task_names
-    from lerobot_memobench.tasks.gap import longest_gap
+    from lerobot_memobench.tasks.catalogue import get_task, longest_cue_to_use, task_names
 
     rows = []
     for number, name in enumerate(task_names(suite=suite), 1):
         task = get_task(name)
         rates = " · ".join(without_memory(task).values())
         link = f"[{title_of(task)}]({card_page(task)}#{slug(name)})"
-        rows.append([str(number), link, task.memory_type, task.operations, str(longest_gap(task) or "–"), rates])
+        rows.append([str(number), link, task.memory_type, task.operations, str(longest_cue_to_use(task) or "–"), rates])
     return f"""# {suite.capitalize()} tasks
 
 `tasks=` accepts the numbers and names. *Operations* are those of the checkpoints: Storage, Update, Compression. The
@@ -544,8 +543,7 @@ def title_of(task: Any) -> str:
 def task_parts(number: int, task: Any) -> Iterator[str]:
     """Yield one task's card."""
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
-    from lerobot_memobench.tasks.catalogue import get_task, task_number
-    from lerobot_memobench.tasks.gap import gaps
+    from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, task_number
 
     drawn = task.suite == "strict"  # the seed draws the instruction
     yield f"## {number}. {title_of(task)} {{ #{slug(task.name)} }}"
@@ -560,7 +558,7 @@ def task_parts(number: int, task: Any) -> Iterator[str]:
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
         ["admissible goals", str(len(task.random_variants))],
     ]
-    measured = " · ".join("–" if gap is None else str(gap) for gap in gaps(task))
+    measured = " · ".join("–" if distance is None else str(distance) for distance in cue_to_use(task))
     rows.append(["[gap](gap.md) of each checkpoint, control steps", measured])
     if task.derived_from:
         page = card_page(get_task(task.derived_from))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.experts.demonstration_prompt import highlight_of
+from lerobot_memobench.experts.expert import highlight_of
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.asset import TABLE, TABLE_TOP, Asset, Grasp
 from lerobot_memobench.sim.object_layout import SLOTS

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_memobench.experts.expert import counts_events, plan_of, steps_of
-from lerobot_memobench.tasks.evidence import handled_atoms
+from lerobot_memobench.tasks.assessment import handled_atoms
 from lerobot_memobench.tasks.formula import Atom, Hold, Not
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.judge.stage import DWELL, Move, Stage, Verdict, judge
@@ -34,7 +34,7 @@ class Case:
         kind: name of the near miss; "right …" for episodes to accept.
         accepted: the verdict that the instruction asks for.
         checkpoint: number of checkpoints that are complete if the case is accepted; None: the goal is reached.
-        choice: whether acceptance is a choice that fits the variant (`tasks.evidence`).
+        choice: whether acceptance is a choice that fits the variant (`tasks.assessment`).
     """
 
     kind: str

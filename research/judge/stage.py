@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.asset import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.evidence import Choice, handled_atoms
+from lerobot_memobench.tasks.assessment import Choice, handled_atoms
 from lerobot_memobench.tasks.formula import LATCHES, Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task

@@ -38,8 +38,8 @@ from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.assessment import chance
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.command import run

@@ -24,7 +24,7 @@ from lerobot_memobench.evaluation.records import read_run, read_runs, sweeps
 from lerobot_memobench.evaluation.report import evaluation_report, failures_table, write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge
-from lerobot_memobench.tasks.failures import FAILURES
+from lerobot_memobench.tasks.assessment import FAILURES
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, facts, rollout, write_log
 

@@ -37,7 +37,7 @@ from lerobot_memobench.evaluation.tables import (
     csv_text,
     to_markdown,
 )
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
+from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 from tests.support import logs
 

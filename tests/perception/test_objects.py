@@ -8,7 +8,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts.demonstration_prompt import highlight_of
+from lerobot_memobench.experts.expert import highlight_of
 from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
 from lerobot_memobench.perception.objects import (
     APART,

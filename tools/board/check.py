@@ -25,9 +25,8 @@ from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evidence import scene_and_variant
-from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
 from lerobot_memobench.tasks.task import REFERENTS, STANDARD, STRICT, Task
 from tools.board.submission import Submission, Submitted, read_submission

@@ -50,7 +50,7 @@ from lerobot_memobench.datasets.layout import (
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError, count_of, cut
-from lerobot_memobench.experts.demonstration_prompt import highlights_at
+from lerobot_memobench.experts.expert import highlights_at
 from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of

@@ -61,8 +61,7 @@ from lerobot_memobench.evaluation.tables import (
     percent_text,
     with_ids,
 )
-from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.catalogue import GROUPS, get_task, libero_id, suite_of
 from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)

@@ -1,7 +1,7 @@
 """Evidence: share of choices that follow the past, where each scene was run with each variant of its task.
 
 A policy without the past that cannot look before it chooses gives the same answer in all variants of a scene. Its rate
-of right answers is the chance (`tasks.evidence.chance`), for any scenes. The terms *warranted choice* and *reliable
+of right answers is the chance (`tasks.assessment.chance`), for any scenes. The terms *warranted choice* and *reliable
 pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
 """
 

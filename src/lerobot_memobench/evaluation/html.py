@@ -46,9 +46,8 @@ from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import draft_of, file_name, refuse_links, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
-from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, load_task, suite_of
+from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, libero_id, load_task, suite_of
 from lerobot_memobench.tasks.formula import format_formula
-from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LEVELS, Task
 
 PAGE = "index.html"

@@ -15,9 +15,8 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
-from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES, classify
+from lerobot_memobench.tasks.catalogue import GROUPS, libero_id, suite_of
 from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
@@ -303,7 +302,7 @@ def mean_rate(rates: Iterable[Rate]) -> Rate:
     return Rate(mean, n, None if math.isclose(effective, n) else effective)
 
 
-# --- failures; the rule itself is `tasks.failures` ---
+# --- failures; the rule itself is `tasks.assessment` ---
 
 _ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
 

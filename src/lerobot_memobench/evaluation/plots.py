@@ -21,8 +21,7 @@ from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report import outcomes
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.gap import gaps
+from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, suite_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -260,7 +259,7 @@ def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) 
 
 EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
 GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
-"""Groups of gaps from cue to use (`tasks.gap`), control steps; the first group needs no memory over time."""
+"""Groups of gaps from cue to use (`catalogue.cue_to_use`), control steps; the first group needs no memory over time."""
 
 
 def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
@@ -278,7 +277,7 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
     if suite_of(record["task"]) is None:
         return
     task = get_task(record["task"])
-    for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
+    for gap, checkpoint in zip(cue_to_use(task), record["checkpoints"], strict=False):
         steps = 0 if gap is None else gap.median
         reached = checkpoint.get("ordered_step") is not None
         yield steps, reached

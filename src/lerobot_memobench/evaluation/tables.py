@@ -19,7 +19,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lerobot_memobench.evaluation.metrics import Rate, percent
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.catalogue import libero_id
 
 NOT_APPLICABLE = "–"
 

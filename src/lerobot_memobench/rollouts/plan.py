@@ -34,7 +34,7 @@ from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkp
 from lerobot_memobench.policies.compatibility import check_features, chosen_convention
 from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.sim.convention import MIRRORED
-from lerobot_memobench.tasks.libero_suites import NUM_STATES, check_states
+from lerobot_memobench.tasks.catalogue import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 if TYPE_CHECKING:
