@@ -16,13 +16,8 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lerobot_memobench.errors import MemobenchError, chain, in_words
-
-if TYPE_CHECKING:
-    pass
-
 
 DRAFT = ".part."
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

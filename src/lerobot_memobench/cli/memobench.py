@@ -217,7 +217,7 @@ def conformance(
     for result in results:
         rows.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
     console().print(rows)
-    failed = [result.check for result in results if result.outcome is FAILED]
+    failed = [result.check for result in results if result.outcome == FAILED]
     say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
     return 1 if failed else 0
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,14 @@ from lerobot_memobench.commands.command_line import (
     read_words,
     setting_kind,
 )
-from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
+from lerobot_memobench.conformance.streams import (
+    EXECUTION_FRAMES,
+    Stream,
+    as_float,
+    read_streams,
+    task_of_texts,
+    write_streams,
+)
 from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
@@ -68,21 +75,6 @@ class Subject:
     cameras: list[str]
     numbers: NDArray[np.int64]
 
-    @property
-    def reads_prompt(self) -> bool:
-        """Whether its configuration declares that it reads prompts."""
-        return reads_prompt(self.policy.config)
-
-    @contextmanager
-    def planning_every(self, steps: int) -> Iterator[None]:
-        """Let it plan at another interval, in control steps."""
-        config, usual = self.policy.config, self.policy.config.n_action_steps
-        try:
-            config.n_action_steps = steps
-            yield
-        finally:
-            config.n_action_steps = usual
-
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.
 
@@ -96,7 +88,9 @@ class Subject:
         actions.reset()
         with EqualNoise() if equal_noise else nullcontext():
             for call in range(max(len(stream) for stream in streams)):
-                batch = self._batch(streams, call)
+                shown = [stream.at(call) for stream in streams]
+                batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in shown]) for key in shown[0]}
+                batch["task"] = [stream.task for stream in streams]
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
                 if sparing and not begins and actions.has_planned_action():
@@ -108,19 +102,12 @@ class Subject:
                 answers.append(action.to("cpu", torch.float32).numpy().copy())
         return np.stack(answers)
 
-    def _batch(self, streams: Sequence[Stream], call: int) -> dict[str, Any]:
-        shown = [stream.at(call) for stream in streams]
-        batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in shown]) for key in shown[0]}
-        return batch | {"task": [stream.task for stream in streams]}
-
     def predict(self, stream: Stream, calls: Sequence[int]) -> Actions:
         """Return the first actions (calls, A) of the chunks predicted for a training batch of these frames."""
         from lerobot.utils.collate import lerobot_collate_fn
 
         batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.indices[call]])] for call in calls])
-        for key in self.cameras:
-            if key in batch and batch[key].dtype == torch.uint8:
-                batch[key] = batch[key].to(torch.float32) / 255
+        batch |= {key: as_float(batch[key]) for key in self.cameras if key in batch}
         self.policy.reset()
         with EqualNoise(), torch.inference_mode():
             chunks = self.policy.predict_action_chunk(self.preprocessor(batch))
@@ -237,7 +224,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
 
 
 def _draw_zero_weights(policy: Any) -> None:
-    """Draw the weights that are initialised to zero, behind which a memory would have no effect."""
+    # Behind weights that are initialised to zero, a memory would have no effect.
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for weights in policy.parameters():
