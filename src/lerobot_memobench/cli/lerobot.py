@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from lerobot_memobench.cli.console import WITH_PARENT, as_path, console, counting, note, run_command, say
+from lerobot_memobench.cli.console import as_path, console, counting, note, run_command, say
 from lerobot_memobench.commands.command_line import (
     CONFIG_FILE,
     HELP,
@@ -51,6 +51,8 @@ if TYPE_CHECKING:
     from lerobot_memobench.jobs.processes import Advance
     from lerobot_memobench.rollouts.plan import EvaluationPlan
 
+WITH_PARENT = "--with-parent"
+"""First argument of a process that ends when its standard input closes, with the process that started it."""
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 """Arguments of Python that start the process of one part."""
 

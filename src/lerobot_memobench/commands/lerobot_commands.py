@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
@@ -28,22 +28,16 @@ def lerobot_commands() -> dict[str, metadata.EntryPoint]:
     }
 
 
-def load_command(name: str) -> Callable[[], Any]:
-    """Return the main function of a LeRobot command, which reads ``sys.argv``. The import takes many seconds.
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``.
 
     Raises:
         MemobenchError: LeRobot was installed without the extra that the command needs.
     """
     try:
-        entry: Callable[[], Any] = lerobot_commands()[name].load()
+        entry = lerobot_commands()[command].load()  # takes many seconds
     except ImportError as error:
-        raise MemobenchError(f"{PREFIX}{name} needs a package that is not installed: {error}") from error
-    return entry
-
-
-def call_lerobot(command: str, flags: Sequence[str]) -> int:
-    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
-    entry = load_command(command)
+        raise MemobenchError(f"{PREFIX}{command} needs a package that is not installed: {error}") from error
     before = sys.argv
     sys.argv = [f"{PREFIX}{command}", *flags]
     try:
