@@ -43,79 +43,47 @@ Key = tuple[str, int]
 
 
 class CheckpointRecord(TypedDict):
-    """A memory checkpoint of a rollout. Execution steps count from 1; None if the predicate never held.
+    """A memory checkpoint of a rollout. Execution steps count from 1; None if the predicate never held."""
 
-    Attributes:
-        operation: Storage, Update or Compression.
-        first_step: first execution step at which it held.
-        ordered_step: first execution step at which it held with all earlier checkpoints complete.
-    """
-
-    operation: Literal["S", "U", "C"]
-    first_step: Count | None
+    operation: Literal["S", "U", "C"]  # Storage, Update or Compression
+    first_step: Count | None  # first execution step at which it held
+    # first execution step at which it held with all earlier checkpoints complete
     ordered_step: NotRequired[Count | None]
 
 
 class EpisodeRecord(TypedDict):
-    """A line of the log.
-
-    Attributes:
-        task: name in the catalogue.
-        memory_type: temporal, spatial, object or procedural; the suite of a task of LIBERO.
-        episode: number of the episode in its evaluation, from 0.
-        seed: seed of the scene: seed base + episode, except in evidence episodes.
-        variant: index of the task's variant; 0 is the published one.
-        prompt_steps: control steps before the execution.
-        prompt_shown: whether the demonstration prompt succeeded; None without a prompt.
-        steps: execution steps.
-        paused_steps: control steps of pauses; only with pauses.
-        held_steps: control steps of holds; strict tasks only.
-        corrupted: whether the memory was corrupted before the episode ended; only with corruption.
-        success: whether the goal held at the end.
-        choice: evidence episodes: variant that the policy acted on; None for no variant.
-        answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
-        variants: evidence episodes: number of variants of the task.
-        chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
-        checkpoints: memory checkpoints in the task's order.
-        failure: failure class; None for a success.
-        fault: reason why the episode was aborted: an invalid action or unstable physics.
-        lost: strict tasks: whether the goal became unreachable.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        scene_hash: hash of the initial scene.
-        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
-        wall_s: duration of the episode, s.
-        not_run: reason why the episode could not be run. Such a line is no rollout and enters no rate.
-        written_at: time of writing, s since 1970; in the workers' files only.
-    """
+    """A line of the log."""
 
     __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]  # a line that states settings is of another format
 
-    task: Name
-    memory_type: Name
-    episode: Whole
-    seed: NotRequired[Whole | None]
-    variant: NotRequired[Count | None]
-    prompt_steps: NotRequired[Count | None]
-    prompt_shown: NotRequired[bool | None]
-    steps: NotRequired[Count | None]
-    paused_steps: NotRequired[Whole]
-    held_steps: NotRequired[Whole]
-    corrupted: NotRequired[bool]
-    success: bool
-    choice: NotRequired[Count | None]
+    task: Name  # name in the catalogue
+    memory_type: Name  # temporal, spatial, object or procedural; the suite of a task of LIBERO
+    episode: Whole  # number of the episode in its evaluation, from 0
+    seed: NotRequired[Whole | None]  # seed of the scene: seed base + episode, except in evidence episodes
+    variant: NotRequired[Count | None]  # index of the task's variant; 0 is the published one
+    prompt_steps: NotRequired[Count | None]  # control steps before the execution
+    prompt_shown: NotRequired[bool | None]  # whether the demonstration prompt succeeded; None without a prompt
+    steps: NotRequired[Count | None]  # execution steps
+    paused_steps: NotRequired[Whole]  # control steps of pauses; only with pauses
+    held_steps: NotRequired[Whole]  # control steps of holds; strict tasks only
+    corrupted: NotRequired[bool]  # whether the memory was corrupted before the episode ended; only with corruption
+    success: bool  # whether the goal held at the end
+    choice: NotRequired[Count | None]  # evidence episodes: variant that the policy acted on; None for no variant
+    # evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant
     answered: NotRequired[bool]
-    variants: NotRequired[Count]
+    variants: NotRequired[Count]  # evidence episodes: number of variants of the task
+    # evidence episodes: rate of correct choices without memory; None if the instruction names the variant
     chance: NotRequired[Number | None]
-    checkpoints: list[CheckpointRecord]
-    failure: NotRequired[Name | None]
-    fault: NotRequired[str]
-    lost: NotRequired[bool]
-    stand_ins: NotRequired[list[Name]]
-    scene_hash: NotRequired[Name | None]
-    settled: NotRequired[bool]
-    wall_s: NotRequired[Number | None]
-    not_run: NotRequired[str]
-    written_at: NotRequired[Number]
+    checkpoints: list[CheckpointRecord]  # memory checkpoints in the task's order
+    failure: NotRequired[Name | None]  # failure class; None for a success
+    fault: NotRequired[str]  # reason why the episode was aborted: an invalid action or unstable physics
+    lost: NotRequired[bool]  # strict tasks: whether the goal became unreachable
+    stand_ins: NotRequired[list[Name]]  # classes whose missing scans this package's objects replaced
+    scene_hash: NotRequired[Name | None]  # hash of the initial scene
+    settled: NotRequired[bool]  # false if an object was thrown, or still moved, when the scene began; absent otherwise
+    wall_s: NotRequired[Number | None]  # duration of the episode, s
+    not_run: NotRequired[str]  # reason why the episode could not be run. Such a line is no rollout and enters no rate
+    written_at: NotRequired[Number]  # time of writing, s since 1970; in the workers' files only
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:

@@ -103,14 +103,5 @@ def longest(settings: EnvSettings) -> int:
     return steps + pauses + drawn + steps // FEWEST_STEPS_AWAY * (shortest + round_up)
 
 
-def paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
-    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
-    chunk = replan_steps or 1
-    pause = _whole_chunks(pause_steps, chunk)
-    fewest, most = STEPS_BETWEEN_PAUSES
-    # A rollout may end in a pause.
-    return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
-
-
 def _whole_chunks(steps: int, chunk: int) -> int:
     return -(-steps // chunk) * chunk
