@@ -92,13 +92,11 @@ class Count:
         self._progress, self._bar = progress, progress.add_task(unit, total=total)
 
     def __call__(self, done: int, total: int, what: str = "", *, trouble: str | None = None, found: int = 0) -> None:
-        """Show that ``done`` of ``total`` pieces of work are done.
+        """Show that ``done`` of ``total`` pieces of work are done, ``found`` of them by an earlier run.
 
-        Args:
-            what: name of the newest piece; "" prints no line. trouble: its failure, printed on a terminal as well.
-            found: pieces that an earlier run has done; they are left out of the speed.
+        ``what``: name of the newest piece; "" prints no line. ``trouble``: its failure, printed on a terminal as well.
         """
-        if done <= found:
+        if done <= found:  # they are left out of the speed
             self._progress.reset(self._bar, total=total, completed=done)
         else:
             self._progress.update(self._bar, total=total, completed=done)
@@ -142,9 +140,7 @@ def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str
 def run_command(call: Callable[[], object], program: str, again: str) -> int:
     """Run a command; return the exit status. A user's mistake is one line on stderr, status 2.
 
-    Args:
-        program: as it is typed, such as ``memobench``.
-        again: how to resume, printed when SIGTERM ends it or a worker process is killed.
+    ``again``: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
         prepare_process()

@@ -173,11 +173,7 @@ def check_tasks(words: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def flags_of_other(words: Mapping[str, str]) -> list[str]:
-    """Return LeRobot's flags for an evaluation of another environment than the benchmark.
-
-    Raises:
-        MemobenchError: no environment is named, an option is the benchmark's, or the checkpoint is not complete.
-    """
+    """Return LeRobot's flags for an evaluation of another environment than the benchmark."""
     from lerobot_memobench.policies.checkpoint import check_checkpoint
 
     for key in words:

@@ -29,14 +29,10 @@ def lerobot_commands() -> dict[str, metadata.EntryPoint]:
 
 
 def call_lerobot(command: str, flags: Sequence[str]) -> int:
-    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``.
-
-    Raises:
-        MemobenchError: LeRobot was installed without the extra that the command needs.
-    """
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
     try:
         entry = lerobot_commands()[command].load()  # takes many seconds
-    except ImportError as error:
+    except ImportError as error:  # LeRobot was installed without an extra
         raise MemobenchError(f"{PREFIX}{command} needs a package that is not installed: {error}") from error
     before = sys.argv
     sys.argv = [f"{PREFIX}{command}", *flags]
@@ -57,10 +53,6 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
 
     The configuration is None elsewhere; the description is known in evaluations. Set the convention for the checkpoint
     of an evaluation; a training may begin with any.
-
-    Raises:
-        MemobenchError: as of `chosen_convention` and `check_obs_type`; or LeRobot's command would run the policy in
-            LIBERO's pipelines.
     """
     from lerobot_memobench.commands.command_line import PATH, parse_words, read_words
     from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY

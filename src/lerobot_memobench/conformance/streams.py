@@ -133,15 +133,11 @@ class Stream:
 
 
 def read_streams(dataset: Any, images: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
-    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
+    """Yield the beginning of each episode of a LeRobotDataset, without delta timestamps, as a rollout observes it.
 
-    Held frames are part of a memory's history in training; a policy that reads no prompt does not train on them.
-
-    Args:
-        dataset: without delta timestamps.
-        images: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
-        frames: number of execution frames that are not held.
+    It has ``frames`` execution frames that are not held. ``objects``: the observed column of object state, or None.
+    With ``prompts``, prompt and held frames are observed (a memory's history in training has them, and a policy that
+    reads no prompt does not train on them), and prompted episodes of few frames come first.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 

@@ -158,8 +158,7 @@ def seed_base(record: Mapping[str, Any]) -> int:
 class EpisodeLog:
     """Append finished rollouts of this process to ``directory``, which is created when the first rollout ends.
 
-    Args:
-        facts: content of the evaluation's file, which is written before the first line; None if it is there.
+    ``facts``: content of the evaluation's file, which is written before the first line; None if it is there.
     """
 
     def __init__(self, directory: str | Path, facts: Mapping[str, Any] | None = None) -> None:
@@ -167,15 +166,9 @@ class EpisodeLog:
         self._facts = facts
 
     def append(self, record: Mapping[str, Any]) -> Path:
-        """Write one rollout durably and return its file.
-
-        The process id is read here, not at construction: a log may be constructed before a fork.
-
-        Raises:
-            MemobenchError: the folder cannot be written or holds episodes of another protocol, the record is not JSON,
-                or its task's name is not a file name.
-        """
+        """Write one rollout durably and return its file; refuse a folder with episodes of another protocol."""
         task = file_name(record["task"], "the task of a record of an episode")
+        # The process id is not read earlier, because a log may be constructed before a fork.
         path = self.directory / EPISODES_FOLDER / f"{task}.{os.getpid()}.jsonl"
         try:
             line = json.dumps({**record, WRITTEN_AT: time.time()}, allow_nan=False).encode() + b"\n"
@@ -248,10 +241,7 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
 
 
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file.
-
-    Arguments and errors as of `read_lines` and `joined`; also raises without an evaluation's file.
-    """
+    """Return all episodes logged in ``directory`` (`read_lines`), each with the facts of the evaluation's file."""
     lines = read_lines(directory, problems)
     return joined(Path(directory), read_evaluation(Path(directory)), lines)
 
@@ -259,8 +249,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 def joined(folder: Path, card: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return lines with the facts of their evaluation's file: settings, inputs, and ``policy``, its identity.
 
-    Raises:
-        MemobenchError: no episode of these settings can have written a line.
+    Refuse a line that no episode of these settings can have written.
     """
     facts = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
     policy = card[POLICY].get("identity") or card[POLICY].get("type")
@@ -278,7 +267,7 @@ def joined(folder: Path, card: Mapping[str, Any], lines: Iterable[Mapping[str, A
 
 
 def _contradictions(record: Mapping[str, Any], own_tasks: bool) -> Iterator[str]:
-    """Yield what a line states that its settings exclude: it is of another evaluation, or was changed."""
+    # A line that contradicts its settings is of another evaluation, or was changed.
     base, evidence, pauses = record.get("seed_base"), record.get("evidence"), record.get("pause_steps")
     if None not in (base, record.get("seed")) and seed_base(record) != base:
         yield f"seed_base: {base} and {seed_base(record)}"
@@ -309,10 +298,7 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
 
     Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
     counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
-    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes.
-
-    Raises:
-        MemobenchError: the folder does not exist or contains no log.
+    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes. Raise without a log.
     """
     directory = Path(directory)
     files = _log_files(directory)
@@ -337,14 +323,12 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
         )
     if problems is not None:
         problems += faults
-    else:
-        for fault in faults:
-            logger.warning("%s", fault)
+    for fault in faults if problems is None else ():
+        logger.warning("%s", fault)
     return [newest[key][1] for key in sorted(newest)]
 
 
 def _without_log(directory: Path) -> MemobenchError:
-    """Return the error for a folder without a log, with the folder that may have been meant."""
     if not directory.is_dir():
         hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
         return MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
@@ -390,7 +374,7 @@ def is_archive(directory: Path) -> bool:
 
 
 def _log_files(directory: Path) -> list[Path]:
-    """Return the merged file first: its lines have no time, so lines of the workers' files replace them."""
+    # The merged file is first: its lines have no time, so lines of the workers' files replace them.
     merged = directory / MERGED_FILE
     whole = [path for path in (packed(merged), merged) if path.is_file()]
     return whole + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))

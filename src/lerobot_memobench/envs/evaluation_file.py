@@ -35,18 +35,11 @@ MOST_EPISODES = 100_000
 
 @dataclass(frozen=True)
 class Acting:
-    """The policy of an evaluation, as its file names it. It is unknown in gymnasium and in LeRobot's trainings.
+    """The policy of an evaluation, as its file names it. It is unknown in gymnasium and in LeRobot's trainings."""
 
-    Attributes:
-        policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.
-        inputs: inputs of the policy in words; None if unknown.
-        seeds: seeds of the requested episodes; None if unknown. Whole batches are run, so there may be other
-            episodes, which are not logged.
-    """
-
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    inputs: str | None = None
-    seeds: range | None = None
+    policy: Mapping[str, Any] = field(default_factory=dict)  # `Policy`
+    inputs: str | None = None  # in words
+    seeds: range | None = None  # of the requested episodes; whole batches are run, and others are not logged
 
     def counts(self, seed: int) -> bool:
         """Return whether the episode of a seed was requested."""
@@ -160,9 +153,6 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     """Return the content of an evaluation's file; ``place``: its folder, or the file.
 
     With ``whole``, require everything that resuming and repeating need.
-
-    Raises:
-        MemobenchError: the file is missing, incomplete, malformed or of another format.
     """
     file = _file_of(place)
     try:
@@ -198,11 +188,7 @@ def facts_of(settings: EnvSettings, acting: Acting) -> dict[str, Any]:
 
 
 def check_facts(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Refuse a folder with an evaluation of another protocol or policy.
-
-    Raises:
-        MemobenchError: the first values are those of the folder.
-    """
+    """Refuse a folder with an evaluation of another protocol or policy."""
     if not has_evaluation(folder):
         return
     if unequal := differences_of_parts(read_evaluation(folder), facts):
@@ -234,9 +220,8 @@ def differences(
 ) -> list[str]:
     """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
 
-    A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`).
-
-    ``extent``: whether tasks and number of episodes are compared.
+    A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`), nor,
+    without ``extent``, tasks and number of episodes.
     """
     left_out = {*ignore, POLICY, SCENE_HASHES, *(() if extent else EXTENT)}
     return _differing({name: value for name, value in a.items() if name not in left_out}, b)

@@ -141,11 +141,7 @@ class MemobenchEnvConfig(_WithSettings):
         return asdict(self.settings)
 
     def selected(self) -> list[tuple[str, int, Path]]:
-        """Return memory type, task id and folder of each chosen task that the controls apply to.
-
-        Raises:
-            MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
-        """
+        """Return memory type, task id and folder of each chosen task that the controls apply to; raise without one."""
         if self.task_dir is None:
             names = resolve_tasks(self.tasks, self.suite)
             tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
@@ -216,12 +212,7 @@ class MemobenchEnvConfig(_WithSettings):
         check_states(self.suite, seed - self.seed_base, episodes)
 
     def settings_for(self, policy: Any) -> EnvSettings:
-        """Return the settings with defaults that follow from a policy's configuration (None if unknown).
-
-        Raises:
-            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan, or these
-                are unknown in strict tasks.
-        """
+        """Return the settings with defaults that follow from a policy's configuration (None if unknown)."""
         settings, executed = self.settings, executed_actions(policy)
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None or reads_prompt(policy) else RESET)

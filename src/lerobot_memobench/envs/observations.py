@@ -184,9 +184,8 @@ def blank(space: spaces.Space[Any]) -> Any:
 class Observer:
     """Render images and compute objects only for frames that are read.
 
-    Attributes:
-        needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
-            for the first and the last frame of the execution, and the frame before which memory is corrupted.
+    While they are not ``needed`` by the policy, observations repeat an earlier frame, except for the first and the last
+    frame of the execution, and the frame before which memory is corrupted.
     """
 
     def __init__(self, settings: EnvSettings) -> None:
