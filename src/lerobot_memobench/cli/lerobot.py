@@ -31,13 +31,14 @@ from lerobot_memobench.commands.command_line import (
     SHORT_FORMS,
     TYPE,
     as_command_line,
+    call_lerobot,
     check_names,
     is_of_benchmark,
+    lerobot_commands,
     parse_words,
     read_words,
     without,
 )
-from lerobot_memobench.commands.lerobot_commands import call_lerobot, lerobot_commands
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import explaining_disk_errors

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 import typing
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -576,3 +577,37 @@ def policy_config(requested: CommandSettings) -> PreTrainedConfig | None:
     if config is not None:
         check_sizes(config)
     return config
+
+
+# --- LeRobot's own commands ---
+
+COMMAND_PREFIX = "lerobot-"
+
+
+def lerobot_commands() -> dict[str, metadata.EntryPoint]:
+    """Return name -> entry point of every command of the installed LeRobot (``eval``: ``lerobot-eval``)."""
+    return {
+        entry.name.removeprefix(COMMAND_PREFIX): entry
+        for entry in metadata.distribution("lerobot").entry_points
+        if entry.group == "console_scripts" and entry.name.startswith(COMMAND_PREFIX)
+    }
+
+
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
+    try:
+        entry = lerobot_commands()[command].load()  # takes many seconds
+    except ImportError as error:  # LeRobot was installed without an extra
+        raise MemobenchError(f"{COMMAND_PREFIX}{command} needs a package that is not installed: {error}") from error
+    before = sys.argv
+    sys.argv = [f"{COMMAND_PREFIX}{command}", *flags]
+    try:
+        status = entry()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        sys.argv = before
+    if status is None or isinstance(status, int):
+        return status or 0
+    print(status, file=sys.stderr)  # as Python does with such a status
+    return 1
