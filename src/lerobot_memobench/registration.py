@@ -55,8 +55,9 @@ def prepare_lerobots_command(environment: MemobenchEnvConfig) -> tuple[PreTraine
     renamed = requested.build_field("rename_map") or {}
     convention = chosen_convention(path, policy, stated, renamed)
     if convention not in (None, environment.convention):  # with the names of its images
-        names: dict[str, Any] = {"features": policy_features(), "features_map": policy_names()}
-        vars(environment).update(vars(replace(environment, **names, convention=convention)))
+        changes: dict[str, Any] = {"features": policy_features(), "features_map": policy_names()}
+        changes["convention"] = convention
+        environment.__dict__.update(vars(replace(environment, **changes)))
     return policy, acting(policy, path, environment.settings)
 
 
