@@ -146,7 +146,7 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
         prepare_process()
         with adding_resume_hint(program, lambda: again):
             result = call()
-            sys.stdout.flush()
+            sys.stdout.flush()  # here, not when Python exits, so that its errors become a sentence too
     except (typer.Abort, KeyboardInterrupt):
         return 130  # as shells do after Ctrl-C
     except typer.Exit as stop:

@@ -118,12 +118,14 @@ class Behaviour:
         """Largest difference of equal actions."""
         weights = next(self.subject.policy.parameters(), None)
         precise = weights is None or str(weights.dtype) == "torch.float32"
+        # Without a memory, the scale is that of changes from call to call.
         effect = self.memory or float(np.abs(self.alone - np.roll(self.alone, 1, axis=0)).max())
         return max(SHARE * effect, LEAST["float32" if precise else "other"])
 
     def differ(self, actions: Actions, other: Actions) -> int | None:
         """Return the first call at which actions differ, None if they are equal."""
         length = min(len(actions), len(other))
+        # Not `>`, so that NaN differs.
         calls = np.flatnonzero(~(np.abs(actions[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
 

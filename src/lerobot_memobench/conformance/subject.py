@@ -164,6 +164,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     for kind in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
         try:
             with quiet():
+                # A copy, because `make_policy` sets the features; and one call, because some raise only there.
                 subject = _built(copy.deepcopy(config), *data, kind, folder / f"view {kind}")
                 subject.roll([subject.streams[0].until(subject.streams[0].start)])
             return subject
@@ -199,11 +200,11 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     if config.type == MEMORY_POLICY:
         training = open_training(whole, open_datasets(whole))
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
-        policy.open_loop = True
+        policy.open_loop = True  # replayed hands do not follow its actions
     else:
         options = view_options(config, raw.meta.features, None, obs_type)
         if not options.prompts:
-            numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1
+            numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1  # the view lacks the other frames
         if needs_view(raw.meta.features, options):
             write_view(Path(raw.root), view, options)
             whole.dataset.root = str(view)
