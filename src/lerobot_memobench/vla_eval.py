@@ -251,10 +251,6 @@ class MEMOBench(StepBenchmark):
         hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
         return {"actions": hold}
 
-    def render(self) -> NDArray[np.uint8]:
-        """Return both cameras under instruction and checkpoints."""
-        return self._running().render()
-
     def _running(self) -> MemobenchEnv:
         if self._env is None:
             raise MemobenchError("no episode is running; call start_episode with one of get_tasks()")
