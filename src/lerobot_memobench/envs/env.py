@@ -346,36 +346,30 @@ class Interference:
         self.shown: Episode | None = None
 
     def begin(self, seed: int) -> None:
-        """Draw the scenes of an episode, outside all splits."""
-        self._seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
-        self._done = 0
+        """Begin with the episodes that follow the prompt of a seed's episode."""
+        self._frames = self._play(seed)
         self.shown = None
 
     def step(self, main: Episode) -> bool:
         """Advance the shown episode by one control step; False if ``main`` itself has to advance."""
         if not main.waits:
             return False
-        if self.shown is None:
-            self._open()
-        elif self.shown.done or self.shown.expert_done:
-            self._done += 1
-            if self._done == len(self._names):
-                self.shown = None
-                main.wait(last=True)
-                return True
-            self._open()
-        else:
-            other = self.shown
-            other.step(np.zeros(ACTION_DIM, np.float32) if other.phase == PROMPT else other.expert_action())
-        main.wait()
+        self.shown = next(self._frames, None)
+        main.wait(last=self.shown is None)
         return True
 
-    def _open(self) -> None:
-        name = self._names[self._done]
-        if name not in self._episodes:
-            self._episodes[name] = Episode(get_task(name), self._settings)
-        self.shown = self._episodes[name]
-        self.shown.reset(int(self._seeds[self._done]))
+    def _play(self, seed: int) -> Iterator[Episode]:
+        # Scenes outside all splits.
+        seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
+        for name, own_seed in zip(self._names, seeds.tolist(), strict=True):
+            if name not in self._episodes:
+                self._episodes[name] = Episode(get_task(name), self._settings)
+            shown = self._episodes[name]
+            shown.reset(own_seed)
+            yield shown
+            while not (shown.done or shown.expert_done):
+                shown.step(np.zeros(ACTION_DIM, np.float32) if shown.phase == PROMPT else shown.expert_action())
+                yield shown
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
