@@ -305,18 +305,11 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
     if not files:
         raise _without_log(directory)
     faults: list[str] = []
-    newest: dict[Key, tuple[float, dict[str, Any]]] = {}
-    outcomes: dict[Key, set[bool]] = {}
-    for file in files:
-        for line in _read_file(file, faults):
-            written = float(line.pop(WRITTEN_AT, 0.0))
-            key = key_of(line)
-            if "not_run" not in line:
-                outcomes.setdefault(key, set()).add(line["success"])
-            if key not in newest or written >= newest[key][0]:
-                newest[key] = (written, line)
-    twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
-    if twice:
+    lines = [line for file in files for line in _read_file(file, faults)]
+    lines.sort(key=lambda line: line.get(WRITTEN_AT, 0.0))  # stable: of equal times, the last file counts
+    newest = {key_of(line): line for line in lines}
+    outcomes = {(key_of(line), line["success"]) for line in lines if "not_run" not in line}
+    if twice := sorted(key for key in newest if {(key, True), (key, False)} <= outcomes):
         faults.append(
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
             f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
@@ -325,7 +318,7 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
         problems += faults
     for fault in faults if problems is None else ():
         logger.warning("%s", fault)
-    return [newest[key][1] for key in sorted(newest)]
+    return [{name: value for name, value in newest[key].items() if name != WRITTEN_AT} for key in sorted(newest)]
 
 
 def _without_log(directory: Path) -> MemobenchError:
