@@ -353,16 +353,22 @@ PROTOCOL_ONLY = {
 
 
 def meanings(kind: Any) -> dict[str, str]:
-    """Return field -> meaning from the docstrings of a `TypedDict` and its bases."""
+    """Return field -> meaning from the comments of a `TypedDict`, above a field or behind it."""
     meaning: dict[str, str] = {}
-    for base in getattr(kind, "__orig_bases__", ()):
-        meaning |= meanings(base)
     if "horizon" in kind.__annotations__:
         from lerobot_memobench.envs.settings import EnvSettings
 
         meaning |= {field.name: field.metadata["meaning"] for field in dataclasses.fields(EnvSettings)}
         meaning |= PROTOCOL_ONLY
-    return meaning | arguments(inspect.getdoc(kind) or "")
+    above: list[str] = []
+    for line in inspect.getsource(kind).splitlines():
+        if comment := re.fullmatch(r" {4}# (.*)", line):
+            above.append(comment[1])
+        elif field := re.fullmatch(r" {4}(\w+): [^#]*(?:  # (.*))?", line):
+            if text := plain(" ".join([*above, field[2] or ""])):
+                meaning[field[1]] = text
+            above = []
+    return meaning
 
 
 def type_name(hint: Any) -> str:

@@ -20,7 +20,7 @@ from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import evidence_line
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
-from lerobot_memobench.envs.pacing import paused
+from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
@@ -224,9 +224,18 @@ def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
     return {each for child in children(formula) for each in _conjuncts(child, kinds)}
 
 
+def _paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
+    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
+    chunk = replan_steps or 1
+    pause = -(-pause_steps // chunk) * chunk  # whole chunks
+    fewest, most = STEPS_BETWEEN_PAUSES
+    # A rollout may end in a pause.
+    return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
+
+
 def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     steps = record.get("paused_steps")
-    possible = paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
+    possible = _paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
     expected: dict[str, Any] = {"paused_steps": steps if steps in possible else possible} if possible else {}
     if protocol["evidence"]:
         choice = record.get("choice")

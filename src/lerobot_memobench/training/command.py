@@ -21,12 +21,12 @@ from lerobot_memobench.commands.command_line import (
     TYPE,
     CommandSettings,
     as_command_line,
+    call_lerobot,
     read_words,
     resolve_recipe,
     value_of,
     without,
 )
-from lerobot_memobench.commands.lerobot_commands import call_lerobot
 from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
