@@ -21,11 +21,7 @@ WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 
 
 def area_averaged(images: Tensor) -> Tensor:
-    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging.
-
-    Raises:
-        MemobenchError: the images are not square.
-    """
+    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging."""
     height, width = images.shape[-2:]
     if height != width:
         raise MemobenchError(
@@ -62,12 +58,9 @@ class ResidualBlock(nn.Module):
 
 
 class VisualEncoder(nn.Module):
-    """A small convolutional network from images to tokens.
+    """A small convolutional network to tokens: stages of ``widths`` channels, with ``blocks`` residual blocks each.
 
-    Args:
-        widths: channels of each stage; the last is the dimension of a token.
-        blocks: residual blocks of each stage.
-        folded: without batch normalisation, as in the file of `weights`.
+    ``folded``: without batch normalisation, as in the file of a detector.
     """
 
     def __init__(

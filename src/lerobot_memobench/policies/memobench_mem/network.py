@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.perception.detector import load_detector
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
-from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     TOKEN_SCALE,
