@@ -12,7 +12,7 @@ import json
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,8 @@ def generate(
         "hold_frames": HOLD_FRAMES,
         **asdict(settings),
         "task_files": [task_hash(task) for task in tasks],
-        "versions": _versions(),
+        # An episode's numbers depend on them.
+        "versions": {name: version(name) for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av")},
     }
     prompts = "" if demonstration_prompt else ", demonstration prompts left out"
     more = "" if prompted_episodes is None else f" ({prompted_episodes} of those with a prompt)"
@@ -175,21 +176,11 @@ def task_hash(task: Task) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av"):  # an episode's numbers depend on them
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = "unknown"
-    return versions
-
-
 # --- size and time ---
 
 
 def run_size(frames: int, image_size: int | None, held_frames: int = 0) -> int:
-    """Return the approximate bytes of numbers of frames and held frames; ``image_size`` is None without images."""
+    """Return the approximate bytes of frames and held frames; ``image_size`` is None without images."""
     area = 0.0 if image_size is None else (image_size / IMAGE_SIZE) ** 2
     return round(frames * FRAME_BYTES + (frames * IMAGES_BYTES + held_frames * HELD_BYTES) * area)
 
@@ -197,11 +188,10 @@ def run_size(frames: int, image_size: int | None, held_frames: int = 0) -> int:
 def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
     """Report the disk space that a run needs, and refuse a run of which not even one copy has room.
 
-    Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
-
-    ``size`` is the dataset's, approximately, ``staged`` of it exists already, ``extra`` is that of temporary files, all
-    in bytes; ``work`` begins the message.
+    ``size`` is the dataset's, ``staged`` of it exists already, ``extra`` is that of temporary files, all in bytes;
+    ``work`` begins the message.
     """
+    # Finished episodes are kept until the dataset is complete, so at its end a run needs twice its size.
     free, most = free_bytes(out), max(2 * size - staged, 0) + extra
     sizes = f"about {in_words(size)} in {out}, {in_words(most)} until it is finished; {in_words(free)} are free there"
     if free < size - staged + extra:

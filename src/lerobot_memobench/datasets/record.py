@@ -69,7 +69,8 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     """Record an episode without images; ``show`` is called with the images of each frame."""
     episode.reset(seed)
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
-    states, proprio, objects, satisfied, actions, executed, held = [], [], [], [], [], [], []
+    frames: list[tuple[NDArray, NDArray, NDArray, NDArray, bool]] = []
+    actions, executed = [], []
     disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
     reached = rests = False
     after = idle = 0
@@ -79,45 +80,41 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
             state, hand, seen = sim.state(), sim.proprio(), episode.objects()
             images = episode.images() if settings.images else None
         rests = episode.idling
-        states.append(state)
-        proprio.append(hand)
-        objects.append(seen)
-        satisfied.append(episode.progress.satisfied)
-        held.append(episode.phase == EXECUTION and not episode.action_has_effect)
+        is_held = episode.phase == EXECUTION and not episode.action_has_effect
+        frames.append((state, hand, seen, np.array(episode.progress.satisfied, np.bool_), is_held))
         if images is not None:
             show(images)
         reached = reached or episode.success
-        idle += episode.expert_done and not held[-1]
+        idle += episode.expert_done and not is_held
         over = reached or episode.done or idle > PATIENCE
         after += over
         wanted = episode.expert_action()
         acting = disturb is not None and episode.action_has_effect
-        done = wanted
-        if disturb is not None and acting and not over:
-            done = disturb.executed(wanted, sim.at_detent)
-        episode.step(done)
+        disturbed = disturb.executed(wanted, sim.at_detent) if disturb is not None and acting and not over else wanted
+        episode.step(disturbed)
         executed.append(episode.applied_action)
         actions.append(np.clip(wanted, -1.0, 1.0) if acting else episode.applied_action)
     assert episode.exec_start is not None
+    states, proprio, objects, satisfied, held = map(np.array, zip(*frames, strict=True))
     labelled, applied = (np.array(column, dtype=np.float32) for column in (actions, executed))
     return Demonstration(
         task=episode.task,
         seed=episode.seed,
         referent=episode.referent,
         variant=episode.task.variant_index,
-        states=np.array(states, dtype=np.float64),
+        states=states.astype(np.float64),
         actions=labelled,
         executed=None if np.array_equal(labelled, applied) else applied,
-        objects=np.array(objects, dtype=np.float32),
-        proprio=np.array(proprio, dtype=np.float32),
+        objects=objects.astype(np.float32),
+        proprio=proprio.astype(np.float32),
         images=None,
         exec_start=episode.exec_start,
-        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(episode.task.checkpoints)),
+        satisfied=satisfied,
         success=reached and episode.prompt_shown is not False,
         fixture_poses=fixture_poses,
         scene_hash=episode.scene_hash,
         stand_ins=episode.stand_ins,
-        held=np.array(held) if any(held) else None,
+        held=held if held.any() else None,
     )
 
 
@@ -150,7 +147,7 @@ class RecordingJob(StagedJob):
         return self.task.name
 
     def run(self) -> None:
-        """Make the episode. Runs in any process; the folder is its only output."""
+        """Make the episode; the folder is the only output."""
         where = f"{self.task.name}, seed {self.seed}"
         try:
             episode = compiled_episode(self.task, self.settings)

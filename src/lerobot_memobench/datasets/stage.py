@@ -58,7 +58,6 @@ class StagedEpisode(BaseModel):
         failure: why there is no demonstration of this seed, or None.
         info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
             episode at least its task's name and seed.
-        language_persistent: LeRobot's persistent language rows (`persistent_rows`).
         image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
         files: name to sha256 of the other files.
     """
@@ -80,7 +79,7 @@ class StagedEpisode(BaseModel):
         return DemonstrationRecord.model_validate(self.info | {"versions": versions})
 
     def video(self, camera: str) -> Path:
-        """Return the file of a camera's video."""
+        """Return the path of a camera's video."""
         return self.folder / f"{camera}.mp4"
 
     def camera_stats(self) -> dict[str, Stats]:
@@ -148,7 +147,10 @@ class EpisodeStage:
 
     def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
         self._folder, self._convention = folder, convention
-        self._temporary = _temporary_folder(folder)
+        # Two workers may make the same episode, so each has a name of its own. A killed worker's folder is removed with
+        # the staging folder.
+        self._temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
+        self._temporary.mkdir(parents=True)
         names = CONVENTIONS[convention].values()
         self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
         self._histograms = {name: ImageHistograms() for name in names}
@@ -196,11 +198,34 @@ class EpisodeStage:
             **columns,
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
-        return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)
+        return self._publish(info, None, persistent_rows(columns), stats)
+
+    def _publish(
+        self, info: dict[str, Any], failure: str | None, rows: list[LanguageRow], image_stats: dict[str, Any]
+    ) -> StagedEpisode:
+        episode = StagedEpisode(
+            failure=failure,
+            info=info,
+            language_persistent=rows,
+            image_stats=image_stats,
+            files={path.name: file_hash(path) for path in sorted(self._temporary.iterdir())},
+            folder=self._folder,
+        )
+        (self._temporary / EPISODE_FILE).write_text(episode.model_dump_json())
+        flush_to_disk([*self._temporary.iterdir(), self._temporary])  # a complete folder never has incomplete files
+        try:
+            self._temporary.rename(self._folder)
+        except OSError:
+            staged = read_staged(self._folder)  # another worker was first
+            if staged is None or staged.info != info:
+                raise MemobenchError(f"{self._folder} holds another episode; delete it and run again") from None
+            return staged
+        flush_to_disk([self._folder.parent])
+        return episode
 
 
 def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
-    """Raise unless a dataset's tables can hold the episode; otherwise the assembly of all episodes would fail."""
+    # Otherwise the assembly of all episodes would fail.
     texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
     try:
         json.dumps([info, texts], ensure_ascii=False).encode()
@@ -223,53 +248,8 @@ def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPR
 
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
     """Store the reason why a seed has no demonstration, so that a resumed run reports it as well."""
-    temporary = _temporary_folder(folder)
-    try:
-        return _publish(temporary, folder, reason, info, [], {})
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _publish(
-    temporary: Path,
-    folder: Path,
-    failure: str | None,
-    info: dict[str, Any],
-    language_rows: list[LanguageRow],
-    image_stats: dict[str, Any],
-) -> StagedEpisode:
-    """Add the record, flush everything to the disk, then give the folder its name."""
-    files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    episode = StagedEpisode(
-        failure=failure,
-        info=info,
-        language_persistent=language_rows,
-        image_stats=image_stats,
-        files=files,
-        folder=folder,
-    )
-    (temporary / EPISODE_FILE).write_text(episode.model_dump_json())
-    flush_to_disk([*temporary.iterdir(), temporary])
-    try:
-        temporary.rename(folder)
-    except OSError:
-        staged = read_staged(folder)  # another worker was first
-        if staged is None or staged.info != info:
-            raise MemobenchError(f"{folder} holds another episode; delete it and run again") from None
-        return staged
-    flush_to_disk([folder.parent])
-    return episode
-
-
-def _temporary_folder(folder: Path) -> Path:
-    """Make and return an empty folder, to be renamed to ``folder`` when it is complete.
-
-    Killed workers leave such folders, which are removed with the staging folder.
-    """
-    # Two workers may make the same episode, so each has a name of its own.
-    temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
-    temporary.mkdir(parents=True)
-    return temporary
+    with EpisodeStage(folder) as stage:
+        return stage._publish(info, reason, [], {})
 
 
 def flush_to_disk(paths: Iterable[Path]) -> None:

@@ -105,10 +105,8 @@ def assemble(
 
     Deterministic: equal episodes give equal files.
 
-    Args:
-        made_by: sentence for the card.
-        manifest: further content of manifest.json.
-        left_out: reasons for the card why further episodes are missing.
+    ``made_by`` is a sentence for the card, ``left_out`` its reasons why further episodes are missing; ``manifest`` is
+    further content of manifest.json.
     """
     out = Path(out)
     written = [episode for episode in episodes if episode.failure is None]
@@ -135,16 +133,18 @@ def assemble(
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
 ) -> tuple[dict[str, dict[str, Any]], list[ListedEpisode]]:
-    """Write the LeRobotDataset of the episodes into ``build``; return its features and its list of episodes."""
     from lerobot.datasets.compute_stats import aggregate_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
-    cameras = written[0].image_stats
+    cameras, image_size = written[0].image_stats, None
+    if cameras:
+        video = video_info(written[0].video(next(iter(cameras))))
+        image_size = (video["video.height"], video["video.width"])
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0]), cameras),
+        features=dataset_features(image_size, cameras),
         root=build,
         robot_type=ROBOT_TYPE,
         use_videos=bool(cameras),
@@ -159,20 +159,9 @@ def _write_lerobot(
     return dict(meta.features), listed
 
 
-def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
-    import av
-
-    for camera in episode.image_stats:
-        with av.open(str(episode.video(camera))) as container:
-            stream = container.streams.video[0]
-            return stream.height, stream.width
-    return None
-
-
 def _write_manifest(
     episodes: Sequence[StagedEpisode], listed: Sequence[ListedEpisode], extra: dict[str, Any], build: Path
 ) -> None:
-    """Write the hashes of all files and requested episodes; failed ones have a reason instead of an index."""
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
     rows, indices = [], iter(listed)
     for episode in episodes:
@@ -188,7 +177,6 @@ def _write_manifest(
 
 
 def _move(build: Path, out: Path) -> None:
-    """Move the finished build into ``out``, which becomes a dataset with the last move."""
     out.mkdir(parents=True, exist_ok=True)
     flush_to_disk(files_below(build))  # `meta` must not arrive before the files that it names
     for name in TOP_LEVEL:
@@ -196,7 +184,7 @@ def _move(build: Path, out: Path) -> None:
         if target.is_dir():
             shutil.rmtree(target)  # of an interrupted move: `meta` is not there yet
         if (build / name).exists():
-            os.replace(build / name, target)
+            os.replace(build / name, target)  # `meta` last: with it the folder is a dataset
     flush_to_disk([out])
     build.rmdir()
 
@@ -207,10 +195,7 @@ def _move(build: Path, out: Path) -> None:
 def _write_frames(
     meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: dict[str, str] | None
 ) -> tuple[dict[str, Stats], list[ListedEpisode]]:
-    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers, and the episodes' places.
-
-    Each episode is one row group, in files of LeRobot's size.
-    """
+    """Write data/, states/, videos/ and meta/; return exact statistics of numbers, and the episodes' places."""
     data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
     numbers: dict[str, list[NDArray]] = {}
     listed: list[ListedEpisode] = []
@@ -284,7 +269,6 @@ def numeric_stats(values: NDArray) -> Stats:
 
 
 def _frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
-    """Return an episode's columns and language rows as a table of the type that LeRobot reads."""
     import pyarrow as pa
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
@@ -305,9 +289,9 @@ def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
 
 
 def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
-    """Return the episode's rows, equal at every frame: built once and repeated by index."""
     import datasets
 
+    # The rows are equal at every frame: built once and repeated by index.
     once = datasets.Dataset.from_dict(
         {LANGUAGE: [episode.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
     ).with_format("arrow")[:]
@@ -349,7 +333,7 @@ class ParquetFiles:
 
     def size(self) -> int:
         """Return the bytes of the current file."""
-        return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
+        return self._path.stat().st_size if self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:
         """Begin the next file."""
@@ -362,14 +346,14 @@ class ParquetFiles:
         """End the current file."""
         if self._writer is not None:
             self._writer.close()
-            self._writer = None
+            self._writer = self._path = None
 
 
 # --- videos ---
 
 
 def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
-    """Join the episodes' videos below the dataset's root; return each episode's columns of meta/episodes."""
+    # Joins the episodes' videos; returns each episode's columns of meta/episodes.
     from lerobot.datasets.io_utils import write_info
     from lerobot.datasets.utils import update_chunk_file_indices
 
