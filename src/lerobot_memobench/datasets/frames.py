@@ -79,11 +79,8 @@ def read_frame_table(root: Path) -> FrameTable:
 
 
 def _resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-    """Assign to each frame without a text that of the next annotated frame of its episode, or else of the last one.
-
-    ``rows`` (N,) are text numbers, -1 for none, which remains in episodes without any text only (paper, framewise
-    alignment).
-    """
+    # A frame without a text (-1) has that of the next annotated frame of its episode, or else of the last one (paper,
+    # framewise alignment).
     resolved = rows.copy()
     for start, end in itertools.pairwise(episodes):
         annotated = np.flatnonzero(rows[start:end] >= 0)
@@ -127,11 +124,8 @@ class FrameLookup:
         encoded: name in a training sample -> features of the present frame.
 
     Attributes:
-        episodes, phase, acts: see `FrameTable`.
         runs: first frames of the parts of episodes between holds, and of the holds, and N.
-        texts: distinct subgoals.
-        text_embeddings: (texts, d_t).
-        memories: distinct oracle memory texts.
+        texts, memories: distinct subgoals, whose embeddings are ``text_embeddings``, and distinct oracle memory texts.
     """
 
     def __init__(
@@ -188,7 +182,7 @@ class FrameLookup:
         return int(self.runs[following - 1]), int(self.runs[following])
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
-        """Return the remembered features (n, P, D) of an episode's slots; slot k is its frame k * stride."""
+        """Return the remembered features (n, P, D) of an episode's slots (`Remember`)."""
         if self._remember is None:
             raise LookupError("this lookup has no remembered features")
         return self._remember(episode, slots)

@@ -47,14 +47,11 @@ def dataset_files(folder: Path) -> list[str]:
 
 
 def without_pattern(folder: Path) -> Path:
-    """Return a path of a dataset's folder for LeRobot, which reads names such as ``obj [v2]`` as patterns of `glob`.
-
-    It is the folder itself, or a link to it in the cache. The link is the same at every call, because LeRobot caches
-    the tables by path.
-    """
+    """Return a dataset's folder, or a link to it in the cache: LeRobot reads names like ``obj [v2]`` as patterns."""
     path = str(folder.absolute())
     if glob.escape(path) == path or not folder.is_dir():
         return folder
+    # LeRobot caches tables by path, so the link is the same at every call.
     link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
     link.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):

@@ -162,7 +162,7 @@ class EpisodeStage:
     def __exit__(self, *_: object) -> None:
         for video in self._videos.values():
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all files are deleted
-                video.abandon()
+                video.close(flush=False)
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:

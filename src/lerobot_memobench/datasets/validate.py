@@ -48,7 +48,7 @@ from lerobot_memobench.datasets.layout import (
     objects_column,
 )
 from lerobot_memobench.datasets.statistics import check_statistics, measured
-from lerobot_memobench.datasets.video import FrameReader, frame_reader
+from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.errors import MemobenchError, count_of, cut
 from lerobot_memobench.experts.demonstration_prompt import highlights_at
 from lerobot_memobench.io import file_hash, files_below
@@ -101,16 +101,10 @@ class _Check:
 def validate(
     folder: Path | str, *, workers: int = 1, progress: Callable[[int, int, CheckResult], None] = lambda *_: None
 ) -> list[CheckResult]:
-    """Replay the episodes of a dataset and check its files.
+    """Replay the episodes of a dataset and check its files (`replay`, `check_file`, `check_statistics`, …).
 
-    States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
-    scene must be equal; some frames of each camera must be near to those of the simulator. Every file is read to its
-    end and compared with its hash, statistics with those of the frames, and the manifest with the episodes.
-
-    ``progress`` is called after each check with the number of finished checks, their total, and the latest result.
-
-    Returns:
-        The result of each episode, in order, then of each file with a disagreement or a note.
+    Return the result of each episode, in order, then of each file with a disagreement or a note. ``progress`` is called
+    after each check with the number of finished checks, their total, and the latest result.
     """
     folder = Path(folder).absolute()
     if workers < 1:
@@ -159,9 +153,7 @@ def images_of(folder: Path, episode: int) -> Images | None:
     return read if cameras else None
 
 
-@lru_cache(maxsize=len(CAMERAS))
-def _reader(folder: Path, camera: str) -> FrameReader:
-    return frame_reader(folder, camera)
+_reader = lru_cache(maxsize=len(CAMERAS))(frame_reader)
 
 
 def _file_checks(folder: Path) -> Iterator[_Check]:
@@ -307,13 +299,8 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
     """Replay an episode and return the first disagreement, or None.
 
     Compared are states (if recorded), proprioception, visible objects, instruction, numbering, every label column,
-    language rows, success, key frames, and the hashes of scene and episode. The episode's hash covers the states, which
-    LeRobot's dataset tools remove.
-
-    ``images`` returns recorded images; some of them are compared.
-
-    Raises:
-        MemobenchError: there is no such task, or the actions were removed.
+    language rows, success, key frames, the hashes of scene and episode, and some of the recorded ``images``. The
+    episode's hash covers the states, which LeRobot's dataset tools remove.
     """
     record, columns = recorded.record, recorded.columns
     task = get_task(record.task_name).variant(record.variant)
@@ -363,7 +350,6 @@ class _ImageCheck:
         self.settings = RenderSettings(height=height, width=width)
 
     def compare(self, sim: Simulation, frame: int) -> None:
-        """Compare the present images if the frame is one of those to draw."""
         if frame not in self._frames or self.difference is not None:
             return
         for camera, frames in self._recorded.items():
@@ -375,7 +361,7 @@ class _ImageCheck:
 
 
 def _unlike(drawn: NDArray[np.uint8], recorded: NDArray[np.uint8]) -> str:
-    """Return the difference of a recorded image to a drawn one, "" if the encoding explains it."""
+    # "" if the encoding explains the difference
     if drawn.shape != recorded.shape:
         return f"an image of {recorded.shape[0]}×{recorded.shape[1]} pixels"
     off = drawn.astype(np.float32) - recorded
@@ -398,9 +384,7 @@ def resimulate(
 ) -> Demonstration:
     """Apply (T, 7) float32 actions in the scene of ``seed``; return the resulting demonstration without images.
 
-    At the end of the prompt the scene returns to its start, except for hidden objects: at frame ``exec_start``, or at
-    the first frame of the rest before it, whose action is zeros. ``held`` (T,) are the frames after which nothing is
-    simulated.
+    ``held`` (T,) are the frames after which nothing is simulated.
     """
     sim = Simulation(task, None if image_check is None else image_check.settings)
     sim.reset(seed)
@@ -414,6 +398,8 @@ def resimulate(
     for frame, action in enumerate(actions):
         rested, rests = rests, strict and frame < exec_start and not action.any()
         rests = rests or (held is not None and bool(held[frame]))
+        # The scene returns to its start, except for hidden objects, at the end of the prompt: the start of execution,
+        # or of the rest before it, whose actions are zeros.
         if 0 < frame <= exec_start and not rested and (rests or frame == exec_start):
             sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
         if frame > 0 and frame == exec_start:
@@ -452,7 +438,7 @@ def resimulate(
 
 
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:
-    """Return the first difference of a common column by frame, then by order of the columns."""
+    # By frame, then by order of the columns.
     first: Disagreement | None = None
     for column, new in replayed.items():
         if column not in recorded:
