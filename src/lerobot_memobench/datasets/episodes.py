@@ -143,9 +143,6 @@ def texts(column: pa.ChunkedArray) -> list[str]:
     return [(value[0] if isinstance(value, list) else value) or "" for value in column.to_pylist()]
 
 
-DETERMINED = {"memory_type", "family", "operations", "success", "key_frames", "scene_hash", "fixture_poses", "digest"}
-
-
 class DemonstrationRecord(BaseModel):
     """The facts of an episode as a whole: its task, seed, placement and hashes.
 
@@ -210,14 +207,6 @@ class DemonstrationRecord(BaseModel):
             stand_ins=list(demo.stand_ins),
         )
 
-    def determined(self) -> dict[str, Any]:
-        """Return the fields that are determined by task, seed and actions."""
-        return self.model_dump(include=DETERMINED)
-
-    def in_frames(self) -> str:
-        """Return the text of the first frame's column."""
-        return self.model_dump_json(exclude_none=True)
-
     def in_meta(self) -> dict[str, Any]:
         """Return the columns of ``meta/episodes``."""
         return self.model_dump(exclude={"versions"}) | {
@@ -253,22 +242,19 @@ def from_meta(row: Mapping[str, Any]) -> DemonstrationRecord | None:
         return None
 
 
-class EpisodeRequest(TypedDict):
-    """A requested episode."""
+class FailedEpisode(TypedDict):
+    """A requested episode that could not be made, and the reason."""
 
     task_name: str
     seed: Whole
-
-
-class FailedEpisode(EpisodeRequest):
-    """An episode that could not be made, and the reason."""
-
     failure: str
 
 
-class MadeEpisode(EpisodeRequest):
-    """An episode of the dataset."""
+class MadeEpisode(TypedDict):
+    """A requested episode of the dataset."""
 
+    task_name: str
+    seed: Whole
     failure: None
     episode_index: Count
     frames: Count

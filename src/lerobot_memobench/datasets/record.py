@@ -170,41 +170,30 @@ class RecordingJob(StagedJob):
 # --- perturbation ---
 #
 # Recovery data: the arm is moved off its way at random, and the closed-loop expert corrects it. The labels of a frame
-# are the expert's actions; the executed ones are kept for replay. A third of the episodes is not perturbed.
+# are the expert's actions; the executed ones are kept for replay.
+# Pushes are standard deviations of an action's six displacements, per step (1 is 5 cm or 0.5 rad); ranges of steps
+# exclude their end.
 
-CLEAN = 1 / 3
-"""Share of unperturbed episodes."""
-NOISE = 0.05
-"""Standard deviation of the noise on each of an action's six displacements (1 is 5 cm or 0.5 rad)."""
-PUSH_CHANCE = 0.02
-"""Probability per step that a push begins."""
-PUSH = np.array([0.6, 0.6, 0.6, 0.1, 0.1, 0.3])
-"""Standard deviations of a push, per step: the hand is moved, and turned mostly about the vertical."""
-PUSH_STEPS = (3, 8)
-"""Range of a push's steps, end excluded."""
+CLEAN = 1 / 3  # share of unperturbed episodes
+NOISE = 0.05  # standard deviation on each displacement
+PUSH_CHANCE = 0.02  # per step
+PUSH, PUSH_STEPS = np.array([0.6, 0.6, 0.6, 0.1, 0.1, 0.3]), (3, 8)  # turns mostly about the vertical
 MISS_CHANCE = 0.2
 """Probability that the hand is pushed away when its fingers begin to close: they close on air, and the expert returns.
 A policy trained without such frames carries an empty hand to the target."""
-MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])
-"""Such a push, upwards, and its standard deviations."""
-MISS_STEPS = (6, 10)
-"""Range of its steps, end excluded: about as long as fingers take to close."""
+MISS, MISS_SPREAD = np.array([0.0, 0.0, 0.8, 0.0, 0.0, 0.0]), np.array([0.25, 0.25, 0.25, 0.0, 0.0, 0.0])  # upwards
+MISS_STEPS = (6, 10)  # about as long as fingers take to close
 TWIST_CHANCE = 0.15
 """Probability that the hand is first turned with open fingers, which then stop at another width than along a side. A
 policy trained without such frames waits for them to close further."""
-TWIST = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25])
-"""Standard deviations of such a push, per step."""
-TWIST_STEPS = (3, 6)
-"""Range of its steps, end excluded."""
+TWIST, TWIST_STEPS = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.25]), (3, 6)
 DROP_CHANCE = 0.05
-"""Probability that a grasped object is dropped on its way."""
 DROP_AFTER, DROP_STEPS = (15, 50), 8
-"""Range of steps from closing to the drop, end excluded, and its duration."""
+"""A grasped object is dropped on its way so many steps after closing, for so many steps."""
 LATE_CHANCE, LATE_STEPS = 0.2, (3, 16)
-"""Probability that fingers stay closed when they should open, and range of these steps, end excluded. A policy trained
-without such frames waits forever instead of opening."""
-COMING_TO_REST = 0.4
-"""Largest component of a displacement at the home detent with which the expert intends to rest there (2 cm)."""
+"""Fingers stay closed for so many steps when they should open. A policy trained without such frames waits forever
+instead of opening."""
+COMING_TO_REST = 0.4  # of a displacement at the home detent with which the expert intends to rest there (2 cm)
 
 Array = NDArray[np.float64]
 

@@ -216,7 +216,7 @@ def _write_frames(
             "task_index": np.full(length, meta.get_task_index(task)),
         }
         info = np.full(length, "", dtype=object)
-        info[0] = record.in_frames()
+        info[0] = record.model_dump_json(exclude_none=True)
         columns = {
             "observation.state": arrays["proprio"],
             "action": arrays["actions"],
