@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_memobench.datasets import record as recording
+from lerobot_memobench.datasets import generate as recording
 from lerobot_memobench.datasets.episodes import list_episodes, read_info
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.datasets.layout import is_dataset

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -48,7 +49,6 @@ from lerobot_memobench.datasets.stage import (
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash, files_below, write_file
-from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:
@@ -76,20 +76,13 @@ def write_dataset(
     """
     out = Path(out)
     check_destination(out)
-    staging = out / STAGING
-    episodes = staging / "episodes"
-    staging.mkdir(parents=True, exist_ok=True)
-    with locked(staging, out):
-        try:
-            shutil.rmtree(episodes, ignore_errors=True)
-            staged = [
-                stage_demonstration(demo, episodes / f"{k:06d}", convention) for k, demo in enumerate(demonstrations)
-            ]
-            return assemble(staged, out, repo_id=repo_id, made_by=made_by)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-            if out.is_dir() and not any(out.iterdir()):
-                out.rmdir()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent) as staging:
+        numbered = enumerate(demonstrations)
+        staged = [stage_demonstration(demo, Path(staging) / f"{k:06d}", convention) for k, demo in numbered]
+        assemble(staged, out, repo_id=repo_id, made_by=made_by)
+    shutil.rmtree(out / STAGING)
+    return out
 
 
 def assemble(
