@@ -552,23 +552,15 @@ def _check_video(path: Path, frames: int) -> None:
         raise MemobenchError(f"{path} has {stated} frames, meta/episodes names {frames}; {ADVICE}")
 
 
-def _read_all(folder: Path) -> None:
-    tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
-    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
-        if not path.is_file():
-            raise MemobenchError(f"{path} is missing; {ADVICE}")
-        if path.suffix == ".json":
-            read_json(path, dict[str, dict[str, Any]], ADVICE, nan=True)
-        else:
-            read_to_end(path)
-
-
 def read_to_end(path: Path) -> None:
-    """Read all values of a table, or decode all frames of a video."""
+    """Read a JSON file, all values of a table, or all frames of a video."""
     import av
     import pyarrow.parquet as pq
 
     with undamaged(path):
+        if path.suffix == ".json":
+            read_json(path, dict[str, Any], ADVICE, nan=True)
+            return
         if path.suffix == ".parquet":
             pq.read_table(path)
             return
@@ -596,8 +588,12 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
         reading = any(name.startswith(("lerobot.datasets.", "datasets.", "torch.utils.data.")) for name in names)
         if folder is None or not reading or not (folder / INFO_FILE).is_file():
             raise
+        files = [path for part in ("data", "meta", "videos") for path in files_below(folder / part, ".parquet", ".mp4")]
         try:
-            _read_all(folder)
+            for path in (folder / STATS_FILE, folder / TASKS_FILE, *files):
+                if not path.is_file():
+                    raise MemobenchError(f"{path} is missing; {ADVICE}")
+                read_to_end(path)
             check_whole(folder)
         except MemobenchError as damage:
             raise damage from error

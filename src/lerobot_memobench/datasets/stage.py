@@ -17,10 +17,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +33,7 @@ from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole
 from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError, short
-from lerobot_memobench.io import file_hash, refuse_links, remove_drafts, write_file
+from lerobot_memobench.io import file_hash, flush_to_disk, refuse_links, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import HeldError, locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
 from lerobot_memobench.untrusted import read_json
@@ -212,7 +211,7 @@ class EpisodeStage:
             folder=self._folder,
         )
         (self._temporary / EPISODE_FILE).write_text(episode.model_dump_json())
-        flush_to_disk([*self._temporary.iterdir(), self._temporary])  # a complete folder never has incomplete files
+        flush_to_disk(*self._temporary.iterdir(), self._temporary)  # a complete folder never has incomplete files
         try:
             self._temporary.rename(self._folder)
         except OSError:
@@ -220,7 +219,7 @@ class EpisodeStage:
             if staged is None or staged.info != info:
                 raise MemobenchError(f"{self._folder} holds another episode; delete it and run again") from None
             return staged
-        flush_to_disk([self._folder.parent])
+        flush_to_disk(self._folder.parent)
         return episode
 
 
@@ -250,16 +249,6 @@ def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpis
     """Store the reason why a seed has no demonstration, so that a resumed run reports it as well."""
     with EpisodeStage(folder) as stage:
         return stage._publish(info, reason, [], {})
-
-
-def flush_to_disk(paths: Iterable[Path]) -> None:
-    """Wait until the disk holds files, or the entries of folders."""
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 # --- the run ---

@@ -43,12 +43,11 @@ from lerobot_memobench.datasets.stage import (
     TEMPORARY,
     StagedEpisode,
     check_destination,
-    flush_to_disk,
     stage_demonstration,
 )
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, files_below, write_file
+from lerobot_memobench.io import file_hash, files_below, flush_to_disk, write_file
 from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:
@@ -171,14 +170,14 @@ def _write_manifest(
 
 def _move(build: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
-    flush_to_disk(files_below(build))  # `meta` must not arrive before the files that it names
+    flush_to_disk(*files_below(build))  # `meta` must not arrive before the files that it names
     for name in TOP_LEVEL:
         target = out / name
         if target.is_dir():
             shutil.rmtree(target)  # of an interrupted move: `meta` is not there yet
         if (build / name).exists():
             os.replace(build / name, target)  # `meta` last: with it the folder is a dataset
-    flush_to_disk([out])
+    flush_to_disk(out)
     build.rmdir()
 
 
