@@ -237,16 +237,17 @@ def _unusable(why: str) -> MemobenchError:
 
 
 class Findings(BaseModel):
-    """Problems and notes of a file, how its images are stored, and its sound groups with height and width of images."""
+    """Groups of a file, size and orientation of their images, problems of the file as a whole, and notes."""
 
-    demonstrations: dict[str, list[Count]] = {}
+    groups: list[str] = []
+    image_size: list[Count] = []  # height and width, of the first sound group
     problems: list[ConversionNote] = []
     notes: list[ConversionNote] = []
     orientation: str | None = None
 
 
 def inspect(file: SourceFile) -> Findings:
-    """Return the findings of a file."""
+    """Return the findings of a file; the conversion of a group reports why it cannot be used."""
     findings = Findings()
 
     def leave_out(group: str, reason: object) -> None:
@@ -258,20 +259,16 @@ def inspect(file: SourceFile) -> Findings:
 
     try:
         with PublishedFile(file.path) as opened, refusing(_unusable):
-            announced, groups = opened.announced(), opened.groups()
-            if announced not in (None, len(groups)):
-                leave_out("data", f"its num_demos is {announced}, but there are {len(groups)} demonstrations")
-            if not groups:
+            announced, findings.groups = opened.announced(), opened.groups()
+            if announced not in (None, len(findings.groups)):
+                leave_out("data", f"its num_demos is {announced}, but there are {len(findings.groups)} demonstrations")
+            if not findings.groups:
                 leave_out("data", "it has no demonstrations")
-            for group in groups:
-                try:
+            for group in findings.groups:
+                with suppress(MemobenchError):
                     demo = opened.read(group)
                     findings.orientation = findings.orientation or orientation_of(opened, demo)
-                except MemobenchError as error:
-                    leave_out(f"data/{group}", error)
-                    continue
-                findings.demonstrations[group] = [*demo.image_size]
-                with suppress(MemobenchError):  # its conversion reports it
+                    findings.image_size = findings.image_size or [*demo.image_size]
                     task = task_of(opened, demo).variant(0)
                     if differences := unlike_the_catalogue(task):
                         note(differences)
@@ -279,9 +276,9 @@ def inspect(file: SourceFile) -> Findings:
                         note(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
     except MemobenchError as error:
         leave_out("", error)
-    if findings.demonstrations and findings.orientation is None:
+    if findings.image_size and findings.orientation is None:
         note("whether its images are upright is not clear, as its state shows none like them: they are not turned")
-    elif findings.demonstrations and findings.orientation != UPRIGHT:
+    elif findings.image_size and findings.orientation != UPRIGHT:
         note(f"its images are {findings.orientation}: they are turned")
     return findings
 
@@ -304,6 +301,7 @@ class _Conversion:
     jobs: list[ConversionJob] = field(default_factory=list)
     problems: list[ConversionNote] = field(default_factory=list)
     notes: list[ConversionNote] = field(default_factory=list)
+    image_size: tuple[int, ...] = ()  # of the first demonstration, which all must have
     resumed: int = 0  # episodes of an earlier run
 
     def add(self, number: int, file: SourceFile) -> None:
@@ -344,12 +342,12 @@ class _Conversion:
         return findings
 
     def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:
-        jobs: list[ConversionJob] = []
-        turn = ORIENTATIONS[findings.orientation or UPRIGHT]
-        for number, (group, (height, width)) in enumerate(findings.demonstrations.items(), len(self.jobs)):
-            size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (height, width))
-            jobs.append(ConversionJob(file.path, group, self.folder / f"{number:06d}", size, turn, self.convention))
-        return jobs
+        self.image_size = self.image_size or tuple(findings.image_size)
+        shared = (self.image_size, ORIENTATIONS[findings.orientation or UPRIGHT], self.convention)
+        return [
+            ConversionJob(file.path, group, self.folder / f"{number:06d}", *shared)
+            for number, group in enumerate(findings.groups, len(self.jobs))
+        ]
 
     def _counting(self, number: int, jobs: int) -> ProgressCallback:
         """Return the callback of a file's jobs; later files are assumed to have as many episodes per byte."""
@@ -372,7 +370,7 @@ class ConversionJob(StagedJob):
     file: Path
     group: str
     folder: Path
-    image_size: tuple[int, int]
+    image_size: tuple[int, ...]
     turn: tuple[int, int]
     convention: str
 
@@ -392,11 +390,10 @@ class ConversionJob(StagedJob):
             with PublishedFile(self.file) as file:
                 with refusing(_unusable):
                     published = file.read(self.group)
-                    if published.image_size != self.image_size:
+                    if self.image_size not in ((), published.image_size):
+                        sizes = ["×".join(map(str, size)) for size in (published.image_size, self.image_size)]
                         raise MemobenchError(
-                            "its images are {}×{} pixels, those of the first demonstration {}×{}".format(
-                                *published.image_size, *self.image_size
-                            )
+                            f"its images are {sizes[0]} pixels, those of the first demonstration {sizes[1]}"
                         )
                     demo = restore(task_of(file, published), published)
                     DemonstrationRecord.of(demo)  # a bad value ends this episode, not the assembly of all
