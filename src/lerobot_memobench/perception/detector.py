@@ -58,33 +58,22 @@ UNCERTAINTIES = ("place", "depth", "height")
 FIRST_UNCERTAINTIES = (0.3, 0.01, 0.01)  # before training
 PRIOR = 0.01  # probability of an object in a cell before training: most cells show none
 
-REFINEMENT_WIDTH, REDUCED_CHANNELS = 96, 24
-"""Width of the refinement head, and channels to which it reduces the encoder's feature map."""
+REFINEMENT_WIDTH, REDUCED_CHANNELS = 96, 24  # the refinement head reduces the encoder's feature map
 MAP_WINDOW, FEATURE_WINDOW = 5, 13
 """Side of the square around a peak that the refinement head reads: in cells of the finest map, and in cells of the
 encoder's feature map, which are half as wide."""
 LOGIT_SCALE = 4.0  # about the standard deviation of heat map logits
 
 DETECTION = np.dtype(
-    [
-        ("kind", "u1"),
-        ("score", "<f4"),
-        ("place", "<f4", 2),
-        ("depth", "<f4"),
-        ("height", "<f4"),
-        ("joint", "<f4"),
-        ("lit", "<f4"),
-        ("turn", "<f4", 2),
-        ("uncertainty", "<f4", len(UNCERTAINTIES)),
-    ]
+    [("kind", "u1"), ("place", "<f4", 2), ("turn", "<f4", 2), ("uncertainty", "<f4", len(UNCERTAINTIES))]
+    + [(name, "<f4") for name in ("score", "depth", "height", "joint", "lit")]
 )
 """A detected object. ``score``: probability. ``place``: of its origin in the image, fractions of the side from the
 upper left corner. ``lit``: probability. ``uncertainty``: expected error of its place, a fraction of the image's side,
 of its depth and of its height, m; 0 if it is not predicted. The others as in `GEOMETRY`."""
 Detections = NDArray[np.void]
 """Detections (n,) of one image, of dtype `DETECTION`."""
-MIN_SCORE, MIN_HEAT = 0.03, 0.3
-"""Smallest score of a detection: with refinement, and without, because the heat map alone is overconfident."""
+MIN_SCORE = 0.03  # smallest score of a detection
 MAX_DETECTIONS = 64  # in an image
 
 CellQuery = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
@@ -249,13 +238,10 @@ def _squares(maps: Tensor, side: int, step: int) -> Tensor:
 
 
 def detections(output: DetectorOutput) -> list[Detections]:
-    """Return the detections of each image, highest score first.
-
-    Their scores are above `MIN_SCORE`, or above `MIN_HEAT` without refinement.
-    """
+    """Return the detections of each image with scores above `MIN_SCORE`, highest first."""
     scores, cells = peaks(output)
     scores, order = scores.sort(dim=1, descending=True, stable=True)
-    which, rank = torch.nonzero(scores > (MIN_HEAT if output.score is None else MIN_SCORE), as_tuple=True)
+    which, rank = torch.nonzero(scores > MIN_SCORE, as_tuple=True)
     image, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
 
     def in_image(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:

@@ -53,8 +53,7 @@ FACING = {"flat_stove": 0.0, "knob": pi / 2} | dict.fromkeys(
     ("drawer", "door", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"), pi
 )
 """Class of fixture or part -> angle of its x axis in the world, as tasks place it and at joint position 0, rad."""
-MIN_SCORE_ALONE = 0.1
-"""Smallest score of a detection by one camera alone."""
+MIN_SCORE_ALONE = 0.1  # of a detection by one camera alone
 APART, SAME = 0.03, 0.04
 """Smallest distance of two objects of a kind, and largest distance of two cameras' detections of one object, m."""
 LIT = 0.5  # smallest probability of a highlighted object
@@ -91,31 +90,23 @@ def rays(places: Array, view: View) -> Array:
 
 @dataclass
 class DetectedObject:
-    """An object, by the detections of one camera or of both.
-
-    Attributes:
-        depth: from the camera that placed it, m. position: of its origin in the world, m.
-        precision: (3, 3) inverse covariance of the position, 1/m². axis: (3,) its x axis or the opposite one, level.
-        joint: m or rad. lit: probability of a highlight around it.
-    """
+    """An object, by the detections of one camera or of both."""
 
     kind: int
     score: float
     cameras: tuple[str, ...]
-    depth: float
-    position: Array
-    precision: Array
-    axis: Array
-    joint: float
-    lit: float
+    depth: float  # from the camera that placed it, m
+    position: Array  # of its origin in the world, m
+    precision: Array  # (3, 3) inverse covariance of the position, 1/m²
+    axis: Array  # (3,) its x axis or the opposite one, level
+    joint: float  # m or rad
+    lit: float  # probability of a highlight around it
 
     def merge(self, other: DetectedObject, unique: bool) -> None:
-        """Merge the detection of another camera with a lower score; ``unique``: a scene has one object of this kind.
-
-        Positions are averaged by their precisions, along each line of sight and across. The rotation is that of the
-        higher score, except the wrist camera's from a large distance. The origins of fixtures and their parts are
-        outside the wrist camera's image, so the other camera alone places them.
-        """
+        """Merge the detection of another camera with a lower score; ``unique``: a scene has one object of this kind."""
+        # Positions are averaged by their precisions. The rotation is that of the higher score, except the wrist
+        # camera's from a large distance. The origins of fixtures and their parts, unique kinds, are outside the wrist
+        # camera's image, so the other camera alone places them.
         outside = other if self.cameras[0] == "wrist" else self
         self.cameras += other.cameras
         self.lit = max(self.lit, other.lit)
