@@ -64,7 +64,7 @@ Notify = Callable[[str], None]
 
 def write_card(
     folder: Path,
-    episodes: Iterable[ListedEpisode],
+    described: Sequence[Described],
     failed: Sequence[StagedEpisode],
     features: dict[str, dict[str, Any]],
     *,
@@ -73,7 +73,6 @@ def write_card(
     left_out: Sequence[str] = (),
 ) -> None:
     """Write ``folder``/README.md: introduction, making, statistics, columns, limitations, licence."""
-    described = described_of(folder, episodes)
     requested = len(described) + len(failed)
     paragraphs = [
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "

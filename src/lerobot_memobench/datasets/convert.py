@@ -33,7 +33,6 @@ from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, res
 from lerobot_memobench.datasets.stage import (
     EpisodeStage,
     StagedJob,
-    check_destination,
     episodes_folder,
     finished_manifest,
     stage_failure,
@@ -115,7 +114,6 @@ def convert(
     if manifest is not None:
         earlier = (map(ConversionNote.model_validate, manifest.get(key, [])) for key in ("left_out", "notes"))
         return ConversionSummary(out, len(manifest["episodes"]), *map(tuple, earlier))
-    check_destination(out)
     with (
         explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, request) as folder,

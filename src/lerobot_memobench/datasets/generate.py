@@ -28,7 +28,6 @@ from lerobot_memobench.datasets.stage import (
     FINISHED_EARLY,
     EpisodeStage,
     StagedJob,
-    check_destination,
     episodes_folder,
     finished_manifest,
     stage_failure,
@@ -130,7 +129,6 @@ def generate(
         manifest = finished_manifest(out, request)
         if manifest is not None:
             return _summary(manifest["episodes"], tasks, out)
-        check_destination(out)
     elif is_dataset(out) or not (out / STAGING).is_dir():
         raise MemobenchError(f"{out} holds no unfinished run; leave --finish out to begin one or to see its outcome")
     continues = "" if finish else ", and the same command continues"

@@ -79,7 +79,6 @@ class PublishedFile:
             if not isinstance(data, h5py.Group):
                 raise MemobenchError(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
             self._data: h5py.Group = data
-            _check_layout(data)
             self.bddl_name = _text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = _text_attribute(data, "bddl_file_content", required=True)
         except Exception as error:
@@ -178,24 +177,6 @@ def _outside(name: str, member: Any) -> str | None:
 
     is_array = isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)
     return name if is_array or isinstance(member, h5py.ExternalLink) else None
-
-
-def _check_layout(data: h5py.Group) -> None:
-    # LIBERO's and robomimic's layouts are similar; the error names the missing parts.
-    import h5py
-
-    first = next((data.get(name) for name in data if demo_number(name) is not None), None)
-    obs = first.get("obs") if isinstance(first, h5py.Group) else None
-    if first is None or not isinstance(obs, h5py.Group) or "meta_data" in first.attrs:
-        return
-    lacks = [f"the attribute {key!r}" for key in ("bddl_file_name", "bddl_file_content") if key not in data.attrs]
-    lacks += [f"the array 'obs/{name}'" for name in IMAGE_NAMES.values() if name not in obs]
-    layout = "LIBERO's" if "agentview_rgb" in obs else "robomimic's" if "env_args" in data.attrs else None
-    if layout is not None:
-        raise MemobenchError(
-            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}; train on it "
-            "with LeRobot's own datasets, or describe its task as docs/develop/add_a_task.md shows"
-        )
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:

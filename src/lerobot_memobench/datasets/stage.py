@@ -277,6 +277,7 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
 
     Episodes of an unfinished run of the same request are kept. Another request, and a run that goes on, are refused.
     """
+    check_destination(out)
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)
     with locked(staging, out):

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from lerobot_memobench.constants import CLOCK, CONTROL_HZ
 from lerobot_memobench.datasets.card import write_card
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
-from lerobot_memobench.datasets.episodes import ListedEpisode
 from lerobot_memobench.datasets.layout import (
     DEFAULT_REPO_ID,
     EPISODE_INFO,
@@ -66,12 +65,11 @@ def write_dataset(
     out: Path | str,
     *,
     repo_id: str = DEFAULT_REPO_ID,
-    made_by: str = "",
     convention: str = UPRIGHT,
 ) -> Path:
     """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
 
-    Either all of them have images or none. ``made_by`` is a sentence for the card, ``convention`` that of the images.
+    Either all of them have images or none; ``convention`` is that of the images.
     """
     out = Path(out)
     check_destination(out)
@@ -79,7 +77,7 @@ def write_dataset(
     with tempfile.TemporaryDirectory(dir=out.parent) as staging:
         numbered = enumerate(demonstrations)
         staged = [stage_demonstration(demo, Path(staging) / f"{k:06d}", convention) for k, demo in numbered]
-        assemble(staged, out, repo_id=repo_id, made_by=made_by)
+        assemble(staged, out, repo_id=repo_id)
     shutil.rmtree(out / STAGING)
     return out
 
@@ -114,17 +112,18 @@ def assemble(
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     versions = (manifest or {}).get("request", {}).get("versions")
-    features, listed = _write_lerobot(written, build, repo_id, versions)  # makes the folder
-    _write_manifest(episodes, listed, manifest or {}, build)
+    features = _write_lerobot(written, build, repo_id, versions)  # makes the folder
+    _write_manifest(episodes, manifest or {}, build)
     failed = [episode for episode in episodes if episode.failure is not None]
-    write_card(build, listed, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    described = [(episode.record(), episode.length) for episode in written]
+    write_card(build, described, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
     _move(build, out)
     return out
 
 
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
-) -> tuple[dict[str, dict[str, Any]], list[ListedEpisode]]:
+) -> dict[str, dict[str, Any]]:
     from lerobot.datasets.compute_stats import aggregate_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
@@ -142,24 +141,22 @@ def _write_lerobot(
         use_videos=bool(cameras),
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    numbers, listed = _write_frames(meta, written, versions)
+    numbers = _write_frames(meta, written, versions)
     of_images = aggregate_stats([episode.camera_stats() for episode in written]) if cameras else {}
     # LeRobot's come in the order of a set, another one in each process.
     meta.stats = numbers | {key: of_images[key] for key in map(image_key, cameras)}
     write_stats(meta.stats, meta.root)
     meta.finalize()
-    return dict(meta.features), listed
+    return dict(meta.features)
 
 
-def _write_manifest(
-    episodes: Sequence[StagedEpisode], listed: Sequence[ListedEpisode], extra: dict[str, Any], build: Path
-) -> None:
+def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], build: Path) -> None:
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
-    rows, indices = [], iter(listed)
+    rows, indices = [], iter(range(len(episodes)))
     for episode in episodes:
         row = {key: episode.info.get(key) for key in keys}
         row |= {key: episode.info[key] for key in ("world", "stand_ins") if key in episode.info}
-        index = next(indices).index if episode.failure is None else None
+        index = next(indices) if episode.failure is None else None
         rows.append(row | {"episode_index": index, "failure": episode.failure})
     files = {
         name: {"bytes": (build / name).stat().st_size, "sha256": file_hash(build / name)}
@@ -186,11 +183,10 @@ def _move(build: Path, out: Path) -> None:
 
 def _write_frames(
     meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: dict[str, str] | None
-) -> tuple[dict[str, Stats], list[ListedEpisode]]:
-    """Write data/, states/, videos/ and meta/; return exact statistics of numbers, and the episodes' places."""
+) -> dict[str, Stats]:
+    """Write data/, states/, videos/ and meta/; return exact statistics of numbers."""
     data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
     numbers: dict[str, list[NDArray]] = {}
-    listed: list[ListedEpisode] = []
     start = 0
     for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
         if data.size() >= meta.data_files_size_in_mb * 1024**2:
@@ -234,11 +230,10 @@ def _write_frames(
             "dataset_to_index": start + length,
         }
         meta.save_episode(number, length, [task], stats, files | videos | record.in_meta())
-        listed.append(ListedEpisode(number, start, length, record))
         start += length
     data.close()
     states.close()
-    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}, listed
+    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}
 
 
 def numeric_stats(values: NDArray) -> Stats:
