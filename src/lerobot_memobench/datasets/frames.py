@@ -183,8 +183,7 @@ class FrameLookup:
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
         """Return the remembered features (n, P, D) of an episode's slots (`Remember`)."""
-        if self._remember is None:
-            raise LookupError("this lookup has no remembered features")
+        assert self._remember is not None
         return self._remember(episode, slots)
 
     def changes(self, episode: int) -> np.ndarray:

@@ -320,7 +320,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
     """Record an episode without images; ``show`` is called with the images of each frame."""
     episode.reset(seed)
     sim, fixture_poses = episode.sim, episode.sim.fixture_poses()
-    frames: list[tuple[NDArray, NDArray, NDArray, NDArray, bool]] = []
+    frames: list[tuple[Any, ...]] = []
     actions, executed = [], []
     disturb = Perturbation(generator(episode.published, seed, PERTURBATION)) if settings.perturb else None
     reached = rests = False
@@ -332,7 +332,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
             images = episode.images() if settings.images else None
         rests = episode.idling
         is_held = episode.phase == EXECUTION and not episode.action_has_effect
-        frames.append((state, hand, seen, np.array(episode.progress.satisfied, np.bool_), is_held))
+        frames.append((state, hand, seen, episode.progress.satisfied, is_held))
         if images is not None:
             show(images)
         reached = reached or episode.success
@@ -360,7 +360,7 @@ def record(episode: Episode, seed: int, settings: RecordingSettings, show: Calla
         proprio=proprio.astype(np.float32),
         images=None,
         exec_start=episode.exec_start,
-        satisfied=satisfied,
+        satisfied=satisfied.astype(np.bool_),
         success=reached and episode.prompt_shown is not False,
         fixture_poses=fixture_poses,
         scene_hash=episode.scene_hash,

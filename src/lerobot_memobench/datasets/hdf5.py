@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,17 +117,13 @@ class PublishedFile:
         import h5py
 
         group = self._data.get(name)
-        if group is None:
-            raise MemobenchError(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
             raise MemobenchError("it is no group demo_<number>")
         states = _array(group, "states", (None, None), np.float64)
         actions = _array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
-        if not isinstance(group.get("obs"), h5py.Group):
-            raise MemobenchError("the group 'obs' is missing")
         images = {
             image: _array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
-            for image in _image_names(group["obs"]).values()
+            for image in _image_names(group.get("obs", ())).values()
         }
         _check_length(group, {"states": states, "actions": actions, **images})
         sizes = {image.shape[1:3] for image in images.values()}
@@ -188,8 +184,6 @@ def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None
     if not length:
         raise MemobenchError("it has no frames")
     count = group.attrs.get("num_samples")
-    if count is None:
-        raise MemobenchError("the attribute 'num_samples' is missing")
     if not isinstance(count, int | np.integer) or int(count) != length:
         raise MemobenchError(f"num_samples is {count}, but its arrays have {length} frames")
 
@@ -199,7 +193,7 @@ def _is_file_object(text: str) -> bool:
     return FILE_OBJECT.fullmatch(text.strip()) is not None
 
 
-def _image_names(obs: h5py.Group) -> dict[str, str]:
+def _image_names(obs: Collection[str]) -> dict[str, str]:
     published = any(name in obs for name in IMAGE_NAMES.values())
     return LIBERO_NAMES if not published and any(name in obs for name in LIBERO_NAMES.values()) else IMAGE_NAMES
 

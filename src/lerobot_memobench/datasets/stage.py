@@ -173,15 +173,10 @@ class EpisodeStage:
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Write everything except the images, which were added before, and give the folder its name."""
-        if self._frames not in (0, len(demo)):
-            raise MemobenchError(
-                f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
-                "were recorded; add one per frame and camera, or none"
-            )
+        assert self._frames in (0, len(demo)), "add images of each frame, or of none"
         columns = labels(demo)
         record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
         info = record | {"language": demo.task.language, "frames": len(demo)}
-        _check_storable(info, columns)
         for video in self._videos.values():
             video.close()
         stats = {
@@ -221,19 +216,6 @@ class EpisodeStage:
             return staged
         flush_to_disk(self._folder.parent)
         return episode
-
-
-def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
-    # Otherwise the assembly of all episodes would fail.
-    texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
-    try:
-        json.dumps([info, texts], ensure_ascii=False).encode()
-        np.array([info["seed"], info["variant"]], dtype=np.int64)
-    except (UnicodeEncodeError, OverflowError) as error:
-        raise MemobenchError(
-            f"{info['task_name']!r}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
-            f"({error}); correct the task's texts or the seed"
-        ) from None
 
 
 def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:

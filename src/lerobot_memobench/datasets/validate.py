@@ -365,8 +365,7 @@ def resimulate(
     start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
     progress = Progress(task)
     look = ObjectSlots(sim)
-    states, proprio, satisfied = [], [], []
-    objects: list[NDArray[np.float32]] = []
+    frames: list[tuple[Any, ...]] = []
     success = rests = False
     strict = task.suite == STRICT
     for frame, action in enumerate(actions):
@@ -382,30 +381,29 @@ def resimulate(
             progress.settle(sim.holds)
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
         show(sim, frame)
-        states.append(sim.state())
-        proprio.append(sim.proprio())
-        objects.append(objects[-1] if rests and rested else look.observe())
-        satisfied.append(progress.satisfied)
+        seen = frames[-1][2] if rests and rested else look.observe()
+        frames.append((sim.state(), sim.proprio(), seen, progress.satisfied))
         success = success or progress.success
         if not rests:
             sim.step(action)
             if frame >= exec_start:
                 progress.step(sim.holds)
+    states, proprio, objects, satisfied = map(np.array, zip(*frames, strict=True))
     return Demonstration(
         task=task,
         seed=seed,
         referent="fixed",
         variant=task.variant_index,
-        states=np.array(states),
+        states=states,
         actions=np.asarray(actions, dtype=np.float32),
-        proprio=np.array(proprio, dtype=np.float32),
+        proprio=proprio.astype(np.float32),
         images=None,
         exec_start=exec_start,
-        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
+        satisfied=satisfied.astype(np.bool_),
         success=success,
         fixture_poses=fixture_poses,
         scene_hash=scene_hash,
-        objects=np.array(objects),
+        objects=objects,
         held=held,
     )
 

@@ -103,12 +103,6 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
                 if stream is None:
                     stream = target.add_stream_from_template(template, opaque=True)
                     stream.time_base = time_base = template.time_base
-                    extradata = template.codec_context.extradata
-                if (template.time_base, template.codec_context.extradata) != (time_base, extradata):
-                    raise MemobenchError(
-                        f"{part} and {videos[0][0]} were encoded with different settings; delete both folders and "
-                        "generate again"
-                    )
                 for packet in source.demux(template):
                     if packet.dts is None or packet.pts is None:
                         continue  # the demuxer's last, empty packet

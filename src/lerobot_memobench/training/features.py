@@ -306,7 +306,7 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
         assert config.visual_encoder is not None  # the configuration has one
         tower = load_visual_encoder(config.visual_encoder)
     else:
-        tower = VisualEncoder(folded=True).eval()
+        tower = VisualEncoder().fold().eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
     return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)

@@ -406,7 +406,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
 def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
     width, camera, thumbnails = config.dimensions.vlm.width, config.memory_camera or "", config.remembers_thumbnails
     if config.uses_visual_encoder:
-        tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
+        tower = vlm.vision_tower = VisualEncoder().fold().eval().requires_grad_(False)
         vlm.multi_modal_projector = nn.Identity()
         return VisualTokenEncoder(tower, [*config.image_features], camera, width, thumbnails)
     if not config.uses_objects:
