@@ -31,12 +31,10 @@ from lerobot_memobench.datasets.episodes import (
     read_episode,
     read_info,
     read_manifest,
-    read_table,
     read_to_end,
 )
 from lerobot_memobench.datasets.layout import (
     ADVICE,
-    EPISODES,
     EXECUTED_ACTION,
     INFO_FILE,
     LANGUAGE,
@@ -105,8 +103,8 @@ def validate(
             f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
             "by `memobench convert`"
         )
-    count = len(read_table(folder / EPISODES, "episode_index".__eq__))
-    checks = [partial(_run, partial(_replay_episode, folder, k), folder, f"episode {k}") for k in range(count)]
+    numbers = range(read_info(folder)["total_episodes"])
+    checks = [partial(_run, partial(_replay_episode, folder, k), folder, f"episode {k}") for k in numbers]
     checks += _file_checks(folder)
     results: dict[int, CheckResult] = {}
 
