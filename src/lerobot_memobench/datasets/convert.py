@@ -55,8 +55,6 @@ from lerobot_memobench.sim.files import check_assets
 from lerobot_memobench.untrusted import Count, check_fetched, read_json, refusing
 
 SUFFIXES = (".hdf5", ".h5")
-MACOS_FOLDER = "__MACOSX"
-"""Folder that macOS adds to archives."""
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
 """Bytes of a frame's images in the published files, which are not compressed."""
 
@@ -200,7 +198,8 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
         raise MemobenchError(
             f"{archive} is no zip archive, or was not downloaded completely ({first_line(error)}); download it again"
         ) from None
-    chosen = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith(MACOS_FOLDER)]
+    # macOS adds a folder with a fork of each file to archives.
+    chosen = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith("__MACOSX")]
     return sorted(chosen, key=lambda entry: entry.filename)
 
 

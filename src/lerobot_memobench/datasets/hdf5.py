@@ -20,15 +20,16 @@ import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import check_regular
-from lerobot_memobench.untrusted import Malformed, check_fetched, parsed, refusing
+from lerobot_memobench.untrusted import Malformed, check_fetched, checked, parsed, refusing
 
 if TYPE_CHECKING:
     import h5py
@@ -133,7 +134,7 @@ class PublishedFile:
             group=name,
             states=_finite("states", states[:]),
             actions=_finite("actions", actions[:]).astype(np.float32),
-            metadata=_json_object(_text_attribute(group, "meta_data", required=True), "meta_data"),
+            metadata=_metadata(_text_attribute(group, "meta_data", required=True)),
             model_file=_text_attribute(group, "model_file") or "",
             image_size=sizes.pop(),
         )
@@ -219,16 +220,20 @@ def _text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     return value
 
 
-def _json_object(text: str, name: str) -> dict[str, Any]:
+class Metadata(TypedDict):
+    """Frames in ``meta_data``, -1 where unknown."""
+
+    key_frame: NotRequired[list[int]]
+    timestep_exec_start_idx: NotRequired[int | Annotated[list[int], MinLen(1)]]
+
+
+def _metadata(text: str) -> dict[str, Any]:
     if _is_file_object(text):
-        raise MemobenchError(f"{name} holds {text[:60]!r}, the name of a Python object instead of its text")
+        raise MemobenchError(f"meta_data holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
-        value = parsed(text)
+        return dict(checked(parsed(text), Metadata))
     except Malformed as error:
-        raise MemobenchError(f"{name} is no valid JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise MemobenchError(f"{name} holds a {type(value).__name__}, expected a JSON object")
-    return value
+        raise MemobenchError(f"meta_data is no valid JSON of a task: {error}") from None
 
 
 def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:

@@ -16,7 +16,6 @@ import tempfile
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from functools import lru_cache
-from itertools import product
 from pathlib import Path, PurePosixPath
 
 import mujoco
@@ -86,11 +85,8 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
 
 
 def _execution_start(task: Task, demo: PublishedDemo) -> int:
-    value = demo.metadata.get("timestep_exec_start_idx", -1)
-    values = value if isinstance(value, list) else [value]
-    if not values or not all(map(_is_integer, values)):
-        raise MemobenchError(f"meta_data has timestep_exec_start_idx {value!r}, expected a frame or -1")
-    start = max(values)
+    value: int | list[int] = demo.metadata.get("timestep_exec_start_idx", -1)
+    start = max(value) if isinstance(value, list) else value
     if start >= len(demo.states):
         raise MemobenchError(f"execution starts at frame {start}, but it has {len(demo.states)} frames")
     if start >= 0:
@@ -109,8 +105,8 @@ def _execution_start(task: Task, demo: PublishedDemo) -> int:
 
 def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     count, length = len(task.checkpoints), len(demo.states)
-    frames = demo.metadata.get("key_frame", [-1] * count)
-    if not isinstance(frames, list) or len(frames) != count or not all(map(_is_integer, frames)):
+    frames: list[int] = demo.metadata.get("key_frame", [-1] * count)
+    if len(frames) != count:
         raise MemobenchError(f"meta_data has key_frame {frames!r}, expected {count} frames, -1 where unknown")
     known = [frame for frame in frames if frame >= 0]
     if known != sorted(known):
@@ -118,10 +114,6 @@ def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     if any(not exec_start <= frame < length for frame in known):
         raise MemobenchError(f"key_frame {frames} is outside of the execution, frames {exec_start} to {length - 1}")
     return frames
-
-
-def _is_integer(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _read_states(
@@ -173,8 +165,12 @@ def _simulation(task: Task) -> Simulation:
 
 # --- the orientation of stored images ---
 
-STORED = (UPRIGHT, "mirrored left to right", "upside down", "rotated by 180 degrees")
-ORIENTATIONS = {name: (rows, columns) for name, (rows, columns) in zip(STORED, product((1, -1), repeat=2), strict=True)}
+ORIENTATIONS = {
+    UPRIGHT: (1, 1),
+    "mirrored left to right": (1, -1),
+    "upside down": (-1, 1),
+    "rotated by 180 degrees": (-1, -1),
+}
 """How images are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0
 """Largest mean difference of images of one frame, of 255 levels, and the least ratio to the next orientation's."""

@@ -39,7 +39,6 @@ from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
 from lerobot_memobench.untrusted import read_json
 
 TEMPORARY = ".tmp-"
-REQUEST_FILE = "request.json"
 EPISODE_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
 FINISHED_EARLY = "finished_early"
@@ -264,7 +263,7 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
     staging.mkdir(parents=True, exist_ok=True)
     with locked(staging, out):
         remove_drafts(staging)
-        path = staging / REQUEST_FILE
+        path = staging / "request.json"
         try:
             earlier = read_json(path, dict[str, Any], "delete its folder to start again")
         except FileNotFoundError:

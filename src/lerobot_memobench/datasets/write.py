@@ -286,15 +286,8 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
 def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
     import pyarrow as pa
 
-    length, width = states.shape
-    offsets = pa.array(np.arange(0, (length + 1) * width, width, dtype=np.int32))
-    return pa.table(
-        {
-            "episode_index": pa.array(np.full(length, number)),
-            "frame_index": pa.array(np.arange(length)),
-            "state": pa.ListArray.from_arrays(offsets, pa.array(states.ravel())),
-        }
-    )
+    numbers = {"episode_index": np.full(len(states), number), "frame_index": np.arange(len(states))}
+    return pa.table(numbers | {"state": pa.array(list(states))})
 
 
 class ParquetFiles:
