@@ -108,7 +108,7 @@ def convert(
     staging = out / STAGING
     files, problems = find_files(source, staging.absolute() / "unpacked")
     request = {"files": [file.identity for file in files], "convention": convention}
-    manifest = finished_manifest(out, request, "left_out")
+    manifest = finished_manifest(out, request)
     if manifest is not None:
         earlier = (map(ConversionNote.model_validate, manifest.get(key, [])) for key in ("left_out", "notes"))
         return ConversionSummary(out, len(manifest["episodes"]), *map(tuple, earlier))
@@ -236,7 +236,7 @@ def _unusable(why: str) -> MemobenchError:
 class Findings(BaseModel):
     """Groups of a file, size and orientation of their images, problems of the file as a whole, and notes."""
 
-    groups: list[str] = []
+    groups: list[str]
     image_size: list[Count] = []  # height and width, of the first sound group
     problems: list[ConversionNote] = []
     notes: list[ConversionNote] = []
@@ -245,7 +245,7 @@ class Findings(BaseModel):
 
 def inspect(file: SourceFile) -> Findings:
     """Return the findings of a file; the conversion of a group reports why it cannot be used."""
-    findings = Findings()
+    findings = Findings(groups=[])
 
     def leave_out(group: str, reason: object) -> None:
         findings.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
@@ -335,7 +335,7 @@ class _Conversion:
         except MemobenchError as error:
             if findings is not None:  # an earlier run found its demonstrations
                 raise MemobenchError(f"{self.source}, {file.name}: {error}") from None
-            return Findings(problems=[ConversionNote(file=file.name, group="", reason=str(error))])
+            return Findings(groups=[], problems=[ConversionNote(file=file.name, group="", reason=str(error))])
         return findings
 
     def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:

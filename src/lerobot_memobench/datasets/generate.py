@@ -149,7 +149,7 @@ def generate(
         summary = _summary([{**episode.info, "failure": episode.failure} for episode in staged], tasks, out)
         if summary.folder is not None:
             assemble(staged, out, repo_id=repo_id, made_by=made_by, manifest={"request": request})
-            shutil.rmtree(out / STAGING)
+            shutil.rmtree(out / STAGING, ignore_errors=True)
         return summary
 
 

@@ -30,11 +30,11 @@ from pydantic import BaseModel, Field
 from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
-from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, image_key, is_dataset
+from lerobot_memobench.datasets.layout import MANIFEST_FILE, STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError, short
 from lerobot_memobench.io import file_hash, flush_to_disk, refuse_links, remove_drafts, write_file
-from lerobot_memobench.jobs.processes import HeldError, locked
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
 from lerobot_memobench.untrusted import read_json
 
@@ -276,30 +276,22 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
         yield folder.absolute()
 
 
-def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dict[str, Any] | None:
+def finished_manifest(out: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """Return the manifest of a finished dataset with this request, None if ``out`` holds no dataset.
 
-    A staging folder that a kill in the last moment left is removed.
-
     Raises:
-        MemobenchError: the dataset is damaged, has another request, or another command made it, whose manifest lacks
-            a ``required`` key.
+        MemobenchError: the dataset is damaged, has another request, or another command made it.
     """
     if not is_dataset(out):
         return None
-    try:
-        manifest = read_manifest(out)
-    except FileNotFoundError:
-        manifest = {}
-    if not {"request", *required} <= set(manifest):
+    manifest = read_manifest(out) if (out / MANIFEST_FILE).exists() else {}
+    if "request" not in manifest:
         raise MemobenchError(f"{out} already holds a dataset that this command did not make; name another folder")
     # A finished dataset stays valid under newer versions.
     earlier = manifest["request"] | {key: value for key, value in request.items() if key == "versions"}
     _compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     check_whole(out)
-    staging = out / STAGING
-    with contextlib.suppress(FileNotFoundError, HeldError), locked(staging, out):
-        shutil.rmtree(staging, ignore_errors=True)
+    shutil.rmtree(out / STAGING, ignore_errors=True)  # a kill in the last moment may have left it
     return manifest
 
 
