@@ -54,8 +54,7 @@ FAMILIES = {
 LENGTH_BUCKETS = {0: 50, 200: 199, 400: 687, 600: 108, 800: 290, 1000: 110, 1200: 31, 1500: 25}
 """Least steps -> episodes of the paper's 1,500."""
 
-Described = tuple[DemonstrationRecord, int]
-"""Record and length of an episode of this benchmark."""
+Described = tuple[DemonstrationRecord, int]  # record and length of an episode of this benchmark
 Notify = Callable[[str], None]
 
 

@@ -32,8 +32,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, STRICT, Task
 
-MAX_CHECKPOINTS = 6
-"""Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
+MAX_CHECKPOINTS = 6  # width of `checkpoint.completed`: no task of the benchmark has more checkpoints
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` searches 0.1 s to either side and raises if it finds two rows of a style, so rows of one
 style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
@@ -50,8 +49,7 @@ HASHED = {
     "memory": MEMORY_COLUMN,
 }
 """Name of a label in an episode's hash -> its column."""
-Labels = dict[str, Any]
-"""Column -> T values: an array, or a list of texts."""
+Labels = dict[str, Any]  # column -> T values: an array, or a list of texts
 LanguageRow = dict[str, Any]
 
 

@@ -54,8 +54,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-Filter = list[tuple[str, str, int]]
-"""Column, comparison and number of the rows to read."""
+Filter = list[tuple[str, str, int]]  # column, comparison and number of the rows to read
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
@@ -450,10 +449,8 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
 
 
 EPISODES_FILE = EPISODES + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-PLACES = ("index", "timestamp", "length", "tasks")
-"""Ends of the names of columns that place episodes and frames."""
-TOLERANCE = 1e-3
-"""Largest difference of times, s or frames."""
+PLACES = ("index", "timestamp", "length", "tasks")  # ends of the names of columns that place episodes and frames
+TOLERANCE = 1e-3  # largest difference of times, s or frames
 
 
 def check_whole(folder: Path) -> None:

@@ -103,12 +103,10 @@ class TextEncoder(Protocol):
 
 # --- lookup ---
 
-Columns = Mapping[str, Tensor]
-"""Column -> its numbers (N, ...) of every frame, in the order of the global index."""
+Columns = Mapping[str, Tensor]  # column -> its numbers (N, ...) of every frame, in the order of the global index
 Remember = Callable[[int, Sequence[int]], Tensor]
 """From (episode, slots) to remembered features (n, P, D); slot k is the episode's frame k * stride."""
-Encoded = Callable[[Sequence[int]], Tensor]
-"""From global indices (n,) to features (n, ...) of those frames."""
+Encoded = Callable[[Sequence[int]], Tensor]  # from global indices (n,) to features (n, ...) of those frames
 
 
 class FrameLookup:

@@ -47,8 +47,7 @@ from lerobot_memobench.tasks.task import STRICT, Task, referent_text
 HOLD_FRAMES = 10
 """Frames recorded after success: the last event has a frame, and the expert completes its motion, so that a less exact
 policy does not stop before it."""
-PERTURBATION = 4
-"""Stream of the episode's random numbers that draws perturbations."""
+PERTURBATION = 4  # stream of the episode's random numbers that draws perturbations
 PATIENCE = 40
 """Steps, without held ones, that an episode continues after the expert has finished its plan: falling or sliding
 objects, and formulas that must hold for some steps, may still reach the goal. Then it is given up, long before the
@@ -280,8 +279,7 @@ def _summary(rows: Sequence[dict[str, Any]], tasks: Sequence[Task], out: Path) -
 
 # --- one episode ---
 
-Images = dict[str, NDArray[np.uint8]]
-"""Camera to a frame, (H, W, 3)."""
+Images = dict[str, NDArray[np.uint8]]  # camera to a frame, (H, W, 3)
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,7 @@ FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
 NO_SEED = -1  # the layout does not hold seeds
 SUFFIX = "_demo.hdf5"
 FRAMES_PER_READ = 32  # in memory at a time
-LARGEST = 1e10
-"""MuJoCo treats a state with a larger number as unstable and replaces it by the initial state."""
+LARGEST = 1e10  # MuJoCo treats a state with a larger number as unstable and replaces it by the initial state
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ from lerobot_memobench.io import cache_folder, files_below
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.sim.object_layout import NAMES
 
-STAGING = ".staging"
-"""Folder of an unfinished run within its destination."""
+STAGING = ".staging"  # folder of an unfinished run within its destination
 DEFAULT_REPO_ID = "memobench/memobench"
 MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
@@ -59,10 +58,8 @@ def without_pattern(folder: Path) -> Path:
     return link
 
 
-EPISODE_INFO = "episode_info"
-"""Column of frames with the episode's record at its first frame, empty elsewhere."""
-LANGUAGE = "language_persistent"
-"""LeRobot's column of language rows."""
+EPISODE_INFO = "episode_info"  # column of frames with the episode's record at its first frame, empty elsewhere
+LANGUAGE = "language_persistent"  # LeRobot's column of language rows
 OBJECTS = "observation.environment_state"
 """Column of visible objects in datasets without images; LeRobot uses a column of this name as an input."""
 PRIVILEGED = "privileged.environment_state"

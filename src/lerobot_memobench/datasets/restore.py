@@ -37,16 +37,13 @@ from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, REFERENTS, Task
 
 States = NDArray[np.float64]
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
+Pose = NDArray[np.float64]  # position and quaternion wxyz, (7,)
 
 BASE = "robot0_base"
-BASE_TOLERANCE = 1e-3
-"""Largest distance of the arm's base from ours, m."""
+BASE_TOLERANCE = 1e-3  # largest distance of the arm's base from ours, m
 NEAR_TABLE = 0.1
 """Largest height of a fixture's origin above or below the table's top, m; LIBERO's are up to 30 mm above it."""
-UNKNOWN = "tasks"
-"""Folder of a task with an unknown memory type."""
+UNKNOWN = "tasks"  # folder of a task with an unknown memory type
 
 
 # --- demonstrations ---
@@ -174,8 +171,7 @@ ORIENTATIONS = {
 """How images are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0
 """Largest mean difference of images of one frame, of 255 levels, and the least ratio to the next orientation's."""
-SIDE = 32
-"""Side at which images are compared, pixels: edges and textures of other renderers do not count."""
+SIDE = 32  # side at which images are compared, pixels: edges and textures of other renderers do not count
 
 
 def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
@@ -211,8 +207,7 @@ KEPT = {
 LEFT_OUT = ("inertial", "camera", "light", "geom", "site")
 BY_DEFAULTS = ("class", "childclass")
 """Attributes that refer to defaults elsewhere in the file; MuJoCo removes them from scenes that it saves."""
-JOINT_TYPES = ("free", "ball", "slide", "hinge")
-"""In MuJoCo's order."""
+JOINT_TYPES = ("free", "ball", "slide", "hinge")  # in MuJoCo's order
 
 
 def joints_of(model: mujoco.MjModel) -> dict[str, tuple[str, NDArray[np.int64]]]:

@@ -41,8 +41,7 @@ from lerobot_memobench.untrusted import read_json
 TEMPORARY = ".tmp-"
 EPISODE_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
-FINISHED_EARLY = "finished_early"
-"""Key of a dataset's request: whether episodes of it were left out."""
+FINISHED_EARLY = "finished_early"  # key of a dataset's request: whether episodes of it were left out
 ADVICE = "it is damaged; delete its folder and run the command again"
 
 

@@ -23,8 +23,7 @@ from lerobot_memobench.io import explaining_disk_errors, write_file
 from lerobot_memobench.untrusted import read_json
 
 IMAGES, TEXTS = ("video", "image"), ("string", "language")
-BLOCK = 64
-"""Images decoded at a time."""
+BLOCK = 64  # images decoded at a time
 NEEDED = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),

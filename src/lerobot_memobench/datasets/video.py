@@ -168,8 +168,7 @@ class ImageHistograms:
         return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
 
 
-TOLERANCE = 1e-4
-"""Largest difference of a decoded frame to its time, s."""
+TOLERANCE = 1e-4  # largest difference of a decoded frame to its time, s
 FrameReader = Callable[[int, list[int]], Any]
 """From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to another input of an encoder."""
 

@@ -56,8 +56,7 @@ if TYPE_CHECKING:
 ROBOT_TYPE = "panda"
 STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PER_STATES_FILE = 100
-BLOCK = 16
-"""Columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes."""
+BLOCK = 16  # columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes
 
 
 def write_dataset(

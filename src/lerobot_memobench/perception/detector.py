@@ -42,12 +42,9 @@ from lerobot_memobench.perception.visual_encoder import (
 
 logger = logging.getLogger(__name__)
 
-LEVELS = 2
-"""Levels of the feature pyramid, each twice as fine as the one before."""
-FINER = 2**LEVELS
-"""Cells of the finest map along a token's side."""
-FINE, COARSE = 4, 2
-"""Cells along a token's side: of heat map and mask, and of geometry."""
+LEVELS = 2  # levels of the feature pyramid, each twice as fine as the one before
+FINER = 2**LEVELS  # cells of the finest map along a token's side
+FINE, COARSE = 4, 2  # cells along a token's side: of heat map and mask, and of geometry
 GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", "turn sine")
 """Values predicted for an object of each kind in each coarse cell. ``across``, ``down``: from the cell's centre to the
 object's origin, in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the
@@ -71,8 +68,7 @@ DETECTION = np.dtype(
 """A detected object. ``score``: probability. ``place``: of its origin in the image, fractions of the side from the
 upper left corner. ``lit``: probability. ``uncertainty``: expected error of its place, a fraction of the image's side,
 of its depth and of its height, m; 0 if it is not predicted. The others as in `GEOMETRY`."""
-Detections = NDArray[np.void]
-"""Detections (n,) of one image, of dtype `DETECTION`."""
+Detections = NDArray[np.void]  # detections (n,) of one image, of dtype `DETECTION`
 MIN_SCORE = 0.03  # smallest score of a detection
 MAX_DETECTIONS = 64  # in an image
 

@@ -45,8 +45,7 @@ ANGLES = {"agentview": AGENTVIEW_ANGLE, "wrist": 75.0}  # fields of view, degree
 
 DRAWERS = ("top_drawer", "middle_drawer", "bottom_drawer")
 """Each drawer is a kind of its own: drawers are closer together than two objects of one kind that can be separated."""
-PARTS = (*DRAWERS, "door", "knob")
-"""Kinds that have a joint; their indices come first."""
+PARTS = (*DRAWERS, "door", "knob")  # kinds that have a joint; their indices come first
 ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
 """Kinds with one object per scene."""
 FACING = {"flat_stove": 0.0, "knob": pi / 2} | dict.fromkeys(

@@ -12,12 +12,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lerobot_memobench.errors import MemobenchError
 
-SIDE = 256
-"""Side of the encoder's images, pixels: the benchmark's own."""
-GRID, POOLED = 8, 4
-"""Sides of the squares of tokens."""
-WIDTH = 192
-"""Dimension of a token."""
+SIDE = 256  # side of the encoder's images, pixels: the benchmark's own
+GRID, POOLED = 8, 4  # sides of the squares of tokens
+WIDTH = 192  # dimension of a token
 WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 """Channels of each stage, which halves the image, and its residual blocks."""
 
