@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import SPLITS
-from lerobot_memobench.datasets.record import Perturbation
+from lerobot_memobench.datasets.generate import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, write_file

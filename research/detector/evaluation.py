@@ -19,9 +19,8 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_memobench.datasets.card import markdown as table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
-from lerobot_memobench.perception.detector import Detections, detections
+from lerobot_memobench.perception.detector import Detections, detections, load_detector
 from lerobot_memobench.perception.objects import LIT, ObjectLocalizer
-from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.data import SCENES, Pictures
 from research.detector.labels import Rows, images_of, kinds

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.objects import DRAWERS, PARTS
+from lerobot_memobench.perception.objects import DRAWERS, PARTS, View
 from lerobot_memobench.perception.visual_encoder import SIDE, area_averaged
 from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import SLOTS
@@ -87,6 +87,15 @@ def kinds_of(sim: Simulation, things: list[Thing]) -> list[int]:
         if name not in kinds():
             raise MemobenchError(f"the detector knows {', '.join(DRAWERS)}, and {name!r} is none; leave its task out")
     return [kinds().index(name) for name in names]
+
+
+def projected(positions: Array, view: View) -> tuple[Array, Array]:
+    """Project points (..., 3) of the world: places (..., 2) in the image, and depths (...) along the view, m."""
+    local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
+    depth = -local[..., 2]
+    # Points in the camera's plane have no place; the bound keeps theirs finite.
+    reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
+    return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
 
 
 def images_of(rows: Rows) -> torch.Tensor:

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.perception.detector import Detector
-from lerobot_memobench.perception.weights import SHIPPED, load_detector, save_detector
+from lerobot_memobench.perception.detector import SHIPPED, Detector, load_detector, save_detector
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.__main__ import main
 from research.detector.data import TESTED, DetectorData, Pictures

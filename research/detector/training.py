@@ -31,14 +31,13 @@ from lerobot_memobench.perception.detector import (
     Heads,
     PyramidLevel,
     peaks,
+    save_detector,
 )
-from lerobot_memobench.perception.objects import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
-from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.training.loop import keep_freed_memory
 from research.detector.data import Pictures
-from research.detector.labels import MASK, Rows, images_of
+from research.detector.labels import MASK, Rows, images_of, projected
 
 CHECKPOINT, LAST_CHECKPOINT = "training.pt", "last.pt"
 WEIGHTS, LOSSES = "detector.safetensors", "losses.csv"

@@ -52,7 +52,7 @@ def record_of(name: str, seed: int, prompt: int, goals: int | None = None) -> st
         digest="",
         world="libero",
         stand_ins=[],
-    ).in_frames()
+    ).model_dump_json(exclude_none=True)
 
 
 def make_object_dataset(

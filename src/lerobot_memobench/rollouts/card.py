@@ -116,7 +116,7 @@ def detector_hash(settings: Mapping[str, Any]) -> str | None:
     """Return the hash of the detector that a policy reads objects from, None without one; raise if it is missing."""
     if settings.get("detector") is None:
         return None
-    from lerobot_memobench.perception.weights import detector_file
+    from lerobot_memobench.perception.detector import detector_file
 
     return file_hash(detector_file(settings["detector"]))
 
