@@ -121,7 +121,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         with contextlib.nullcontext() if draw else no_init_weights():
             self.model = MemoryPI05(config)
         dims = config.dimensions
-        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, config.tokens_per_frame)
+        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, self.perception.tokens_per_frame)
         self.precision = Precision(list(self.parameters()))
         if dataset_meta is not None:
             self.precision.settle()  # before loading weights, which may be float32

@@ -249,7 +249,7 @@ def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) ->
     mechanism, dims = find_mechanism(config.memory), config.dimensions
     spec = MemorySpec(
         dim=observations.dim,
-        tokens=config.tokens_per_frame,
+        tokens=observations.tokens_per_frame,
         width=dims.vlm.width,
         expert=dims.expert.width,
         grid=observations.grid,

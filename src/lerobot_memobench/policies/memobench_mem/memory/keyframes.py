@@ -96,7 +96,6 @@ class Keyframes(MemoryMechanism):
     # -- a rollout ---------------------------------------------------------------------------------------------------
 
     def init(self, rows: int) -> State:
-        """Return no frames and the empty text."""
         like = self.ask
         frame = rows, RECENT + NOMINATED, self.spec.tokens, self.spec.dim
         return {
@@ -146,7 +145,6 @@ class Keyframes(MemoryMechanism):
         return keyframes[rows, chosen.clamp(min=0)], chosen >= 0
 
     def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the words of the text that the high level chose last."""
         return MemoryTokens(*self.texts(state["text"]))
 
     # -- a training --------------------------------------------------------------------------------------------------
@@ -197,6 +195,5 @@ class Keyframes(MemoryMechanism):
         return slots, ends.gather(1, recent.clamp(min=0)) & (recent >= 0)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the losses of the last replay with labels, for the checkpoint and for the keyframes."""
         losses, self._losses = self._losses, {}
         return losses

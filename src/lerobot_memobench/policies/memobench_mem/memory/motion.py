@@ -69,32 +69,29 @@ class MotionExpert(nn.Module):
 
 
 class ForesightPass(MemoryPass):
-    """A pass with hindsight in the condition of the expert's norms, and motion queries before the actions."""
+    """A pass with hindsight in the condition of the expert's norms, and motion queries before the actions.
+
+    Queries and actions attend to each other. The queries shift the actions' positions by `FORESIGHT`.
+    """
 
     def __init__(self, expert: MotionExpert, memory: MemoryTokens) -> None:
         super().__init__()
         self.expert, self.hindsight = expert, expert.condition(memory.rows().squeeze(1))
 
     def actions(self, tokens: Tensor) -> Tensor:
-        """Insert the queries before the actions; queries and actions attend to each other."""
         queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
         return torch.cat([queries, tokens], dim=1)
 
     def condition(self, condition: Tensor) -> Tensor:
-        """Add hindsight."""
         hindsight: Tensor = self.hindsight
         return condition + hindsight
 
     def expert_states(self, states: Tensor) -> None:
-        """Decode the motion (B, n, C k) that the queries predict."""
         self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
 
 
 class Foresight(MemoryFusion):
-    """Add hindsight to the condition of the expert's norms, and insert motion queries before the actions.
-
-    The actions' positions are therefore shifted by `FORESIGHT` from those of plain pi0.5.
-    """
+    """Let actions read hindsight, and predict the next motions (`ForesightPass`)."""
 
     parts = ("foresight.",)
 
@@ -104,7 +101,6 @@ class Foresight(MemoryFusion):
         model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass conditioned on this memory."""
         return ForesightPass(self.model.foresight, memory)
 
 
@@ -135,23 +131,19 @@ class Motion(MemoryMechanism):
 
     @classmethod
     def make_pool(cls, observations: Any, spec: MemorySpec) -> MotionField:
-        """Return the motion field for the stored frames of an encoder."""
         if isinstance(observations, ObjectEncoder):
             return ObjectMotion(observations.order, observations.kinds, spec.expert, HINDSIGHT)
         return ImageMotion(spec.expert, HINDSIGHT)
 
     @property
     def field(self) -> MotionField:
-        """The motion field between two stored frames."""
         return cast(MotionField, self.pool)
 
     @classmethod
     def slots(cls, slot: int, settings: NoSettings) -> Sequence[int]:
-        """Return the last frames, between which the motions are."""
         return range(max(0, slot - HINDSIGHT), slot + 1)
 
     def init(self, rows: int) -> dict[str, Tensor]:
-        """Return zero motion, and no last frame."""
         like, field = self.summary, self.field
         return {
             "frame": like.new_zeros(rows, 1, field.size),
@@ -160,11 +152,9 @@ class Motion(MemoryMechanism):
         }
 
     def pooled(self, frames: Tensor) -> Tensor:
-        """Return the stored frames: motion is found between them."""
-        return frames
+        return frames  # motion is found between stored frames
 
     def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
-        """Append the motion to stored frames."""
         count, motions = state["frames"], state["motions"]
         moved = self.field.between(state["frame"].to(tokens.dtype), tokens).to(motions.dtype).unsqueeze(1)
         first, second = (rearrange(count == number, "r -> r 1 1 1") for number in (0, 1))
@@ -173,11 +163,9 @@ class Motion(MemoryMechanism):
         return {"frame": tokens.to(state["frame"].dtype), "motions": motions, "frames": (count + 1).clamp(max=2)}
 
     def noised(self, state: Any, generator: torch.Generator) -> dict[str, Tensor]:
-        """Return the state with noise on its motions, not on the last frame."""
-        return {**state, "motions": with_noise(state["motions"], generator)}
+        return {**state, "motions": with_noise(state["motions"], generator)}  # not the last frame
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Encode the motions to one token."""
         return self._encoded(state["motions"])
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
@@ -224,7 +212,7 @@ class Motion(MemoryMechanism):
 class MotionField(nn.Module, ABC):
     """Motion between two stored frames of D' numbers (``size``), and tokens of it, whose layers are trained.
 
-    There are C ``cells``, of K ``numbers`` each; the first ``moved`` are motion.
+    There are C ``cells`` of K ``numbers``; the first ``moved`` of these are motion.
     """
 
     size: int
@@ -306,7 +294,6 @@ class ImageMotion(MotionField):
         self.places = nn.Parameter(torch.randn(side**2, width) * 0.02)
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
-        """Match the blocks of thumbnails."""
         earlier, later = (frames.to(torch.float32).reshape(-1, THUMBNAIL, THUMBNAIL) for frames in (before, now))
         return match_blocks(earlier, later).flatten(1, 2)
 
@@ -336,8 +323,8 @@ MOVED = 4
 class ObjectMotion(MotionField):
     """Displacement of each slot's thing and of the hand; one token per pair of frames, pooled by learned attention.
 
-    A cell's numbers are its motion, whether it is known, its class, and its place. The hand has class ``kinds``.
-    ``order`` and ``kinds`` are as of `objects.SlotEncoder`.
+    A cell's numbers are its motion, whether it is known, its class (``kinds`` for the hand), and its place. ``order``
+    and ``kinds`` are as of `objects.SlotEncoder`.
     """
 
     size, cells, numbers, moved = SIZE + HAND_DIM + 1, SLOTS + 1, MOVED + 5, MOVED
@@ -399,7 +386,6 @@ class ObjectMotion(MotionField):
         return moved, knowns
 
     def tokens(self, fields: Tensor) -> Tensor:
-        """Return a token per pair of frames."""
         moved, known, kind, position = fields.split([MOVED, 1, 1, 3], dim=-1)
         kinds = torch.tensor(self.order, device=fields.device)[kind.squeeze(-1).long()]
         features = self.mlp(torch.cat([moved, position, self.kind(kinds)], dim=-1))

@@ -63,7 +63,7 @@ def scored(scores: Tensor, choices: Tensor) -> Tensor:
 
 
 class SubgoalChoice(nn.Module):
-    """Modules that the narrow channel adds: a last token of the prefix, whose last state is scored, and the texts."""
+    """A last token of the prefix, whose last state is scored, and the texts."""
 
     def __init__(self, texts: tuple[str, ...], width: int) -> None:
         super().__init__()
@@ -84,9 +84,8 @@ class NarrowPass(MemoryPass):
 
     The state's own token attends to the whole prefix, so reading it would open a second channel; hence the copy. If
     the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
-    the instruction.
-
-    In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen`` (B,), S: none).
+    the instruction. In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen``
+    (B,), S: none).
     """
 
     watches = ("prefix",)
@@ -99,15 +98,19 @@ class NarrowPass(MemoryPass):
         self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, the text and the copy of the state."""
         memory, true = self.memory, self.query.subgoal
         own = prefix.tokens[:, : 0 if state is None else state + 1][:, -1:]
         ask = repeat(self.choice.ask, "1 1 d -> b 1 d", b=len(own))
         prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
         unread, none = prefix.tokens.shape[1], self.choice.score.out_features
         prefix = prefix._replace(asked=slice(unread - 1, unread))
-        chosen = self.chosen = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
-        text, of_text = self.choice.texts(chosen)
+        if true is None:
+            with torch.no_grad():
+                self.model.read_prefix(prefix, self)
+                self.chosen = self.outputs[SCORES].argmax(dim=1)
+        else:
+            self.chosen = torch.where(true < 0, none, true)
+        text, of_text = self.choice.texts(self.chosen)
         if self.model.instruction is not None:
             prefix = prefix._replace(instruction=self.model.instruction(text, of_text))
         whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
@@ -125,13 +128,7 @@ class NarrowPass(MemoryPass):
         seen = torch.where(of_query == 2, of_key == 2, of_key <= of_query)
         return seen.expand(len(prefix.tokens), -1, -1)
 
-    @torch.no_grad()
-    def _chosen(self, prefix: Prefix) -> Tensor:
-        self.model.read_prefix(prefix, self)
-        return self.outputs[SCORES].argmax(dim=1)
-
     def read_out(self, states: Tensor) -> None:
-        """Score the texts by the last state of ``ask``: (B, S + 1)."""
         assert self.query.choices is not None
         score = self.choice.score
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
@@ -160,7 +157,6 @@ class NarrowChannel(MemoryFusion):
         model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
         return NarrowPass(self.model, memory, watched)
 
 
@@ -176,11 +172,9 @@ class Subgoal(FrameSampling):
     fusion = NarrowChannel
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and pass on the texts to choose from."""
         return super().read(state, query)._replace(query=query)
 
     def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and pass on the texts to choose from and the true text."""
         return super().replay(histories, query)._replace(query=query)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
