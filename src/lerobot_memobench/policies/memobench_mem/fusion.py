@@ -1,7 +1,4 @@
-"""How actions read memory tokens, and the operations of pi0.5's layers that this needs.
-
-`MemoryFusion` is the interface, `MemoryPass` the memory in one pass of the model. `Modulation` scales and shifts the
-input of each feed-forward layer of the action expert (RoboMME's modulator); `Context` appends memory to the prefix.
+"""How actions read memory tokens (`MemoryFusion`), and the operations of pi0.5's layers that this needs.
 
 Shapes: B rows, L memory tokens, W width of the action expert, T action tokens, N queries, M keys, H heads of width d.
 """
@@ -65,9 +62,8 @@ def hidden(real: Tensor) -> Tensor:
 def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, collected: list[Tensor] | None = None) -> Tensor:
     """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
 
-    Args:
-        bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
-        collected: a list to which the attention weights (B, H, N, M) are appended.
+    ``bias``, as of `hidden`, is (B, 1, M), or (B, N, M) if it differs between queries. The attention weights
+    (B, H, N, M) are appended to ``collected``.
     """
     rows, count, heads, width = query.shape
     # All heads share keys and values, so heads are further queries of one product.
@@ -192,7 +188,6 @@ class RMSNorm(nn.Module):
         self.weight = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise x (..., W), in float32."""
         return rms_norm(x) * (1.0 + self.weight)
 
 
@@ -239,13 +234,12 @@ class MemoryModulator(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
-        A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
-        ``collected``.
+        The attention on each memory token (B, L) is appended to ``collected``.
         """
         weights = None if collected is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
-        # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
+        # A finite bias keeps the softmax of a fully masked row finite; the row then reads zeros.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
         if collected is not None and weights is not None:
             collected.append(weights[0].mean(dim=(1, 2)) * memory.mask)
@@ -255,7 +249,7 @@ class MemoryModulator(nn.Module):
 
 
 class ModulationPass(MemoryPass):
-    """A pass whose expert is scaled and shifted by memory of the expert's width W."""
+    """A pass whose expert is scaled and shifted by memory of the expert's width W; the residual is not changed."""
 
     watches = ("memory",)
 
@@ -266,19 +260,17 @@ class ModulationPass(MemoryPass):
         self.keys = None if torch.is_grad_enabled() else [modulator.keys(memory) for modulator in modulators]
 
     def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
-        """Scale and shift pi0.5's input; the residual is not changed."""
         modulator = self.modulators[layer]
         keys = modulator.keys(self.memory) if self.keys is None else self.keys[layer]
         scale, shift = modulator(normed, self.memory, keys, self.attention.get("memory"))
         return torch.addcmul(shift, inputs, 1 + scale)
 
     def attention_shares(self) -> list[Tensor]:
-        """Return the modulators' attention to each token."""
         return self.attention["memory"]
 
 
 class Modulation(MemoryFusion):
-    """Project memory to the expert's width, and modulate each of the expert's layers."""
+    """RoboMME's modulator: scale and shift the input of each feed-forward layer of the action expert."""
 
     reports_reads = True
     parts = ("memory_to_expert.", "modulators.")
@@ -290,7 +282,6 @@ class Modulation(MemoryFusion):
         model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Project the memory to the expert's width."""
         return ModulationPass(memory.map(self.model.memory_to_expert), [*self.model.modulators], watched)
 
 
@@ -298,7 +289,7 @@ class Modulation(MemoryFusion):
 
 
 class ContextPass(MemoryPass):
-    """A pass whose prefix ends with the memory."""
+    """A pass whose prefix ends with the memory, which attends and is attended to like images and language."""
 
     watches = ("actions",)
 
@@ -307,11 +298,9 @@ class ContextPass(MemoryPass):
         self.memory = memory
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, which attends and is attended to like images and language."""
         return prefix.joined(self.memory.rows(), self.memory.mask)
 
     def attention_shares(self) -> list[Tensor]:
-        """Return the share of the actions' attention on each memory token."""
         length = self.memory.mask.shape[1]
         # (B, heads, T, prefix and T), with memory at the prefix's end
         return [
@@ -326,5 +315,4 @@ class Context(MemoryFusion):
     reports_reads = True
 
     def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over this memory."""
         return ContextPass(memory, watched)

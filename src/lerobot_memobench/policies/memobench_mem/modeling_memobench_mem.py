@@ -1,7 +1,4 @@
-"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts.
-
-This file is the policy: its construction, updates (``forward``) and actions (``select_action``).
-"""
+"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts."""
 
 from __future__ import annotations
 
@@ -86,14 +83,7 @@ trained."""
 
 
 class MemobenchMemPolicy(PreTrainedPolicy):
-    """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame.
-
-    Attributes:
-        alignment: objective and head that align memory with text; None without alignment.
-        precision: of the weights.
-        rollout: the environments of the present rollout.
-        open_loop: whether observations do not follow the actions, as in replayed episodes: no hand is stalled.
-    """
+    """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame."""
 
     config_class = MemobenchMemConfig
     name = "memobench_mem"
@@ -109,12 +99,10 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         draw: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Build the policy from scratch, or from ``config.base_weights``.
+        """Build the policy from scratch, or from ``config.base_weights``; without ``dataset_meta`` it only acts.
 
-        Args:
-            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-            load_base: False if a checkpoint's weights are loaded afterwards.
-            draw: False to skip the initialisation of weights, which takes two minutes at full size.
+        ``load_base=False`` if a checkpoint's weights are loaded afterwards; then ``draw=False`` skips initial weights,
+        which take two minutes at full size.
         """
         super().__init__(config)
         config.validate_features()
@@ -133,13 +121,13 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
-        self._watched = self.open_loop = False
+        self._watched = False
+        self.open_loop = False  # True if observations do not follow the actions, as in replayed episodes: no stalls
         self.reset()
         self._thread: int | None = None  # set by the first action
 
     @property
     def perception(self) -> ObservationEncoder:
-        """The encoder of observations."""
         return self.model.paligemma_with_expert.perception
 
     @property
@@ -182,11 +170,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
         The numbers are ``action_loss``, the memory's losses, and with an alignment ``align_loss`` (unweighted),
         ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1`` (share of memory
-        vectors whose nearest text in the batch is their own).
-
-        Args:
-            batch: of the training's preprocessor. A policy without memory also takes those of LeRobot's own trainer.
-            reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
+        vectors whose nearest text in the batch is their own). ``reduction="none"`` returns a loss per sample (B,).
         """
         batch = self.perception.observed(self._with_phase(batch))
         measures = not self.training and not torch.is_grad_enabled()
@@ -284,9 +268,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every environment (B, A), normalised.
 
-        An environment is replanned when its execution begins or its queue is empty (`EnvMemory.begin_chunk`). A chunk
-        depends on its own environment only. No chunk is planned in the prompt phase, in which actions have no effect,
-        and for frozen environments.
+        An environment is replanned when its execution begins or its queue is empty. A chunk depends on its own
+        environment only. No chunk is planned in the prompt phase, in which actions have no effect, and for frozen
+        environments.
         """
         self._check_thread()
         if self.training:  # calling eval() at every step would take a millisecond
@@ -384,7 +368,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         self._watched = watched
 
     def memory_reads(self) -> list[list[Chunk]]:
-        """Return the memory reads of the chunks of each environment's episode."""
         return [env.reads for env in self.rollout.envs]
 
     def _require_history(self, rows: list[int]) -> None:

@@ -154,7 +154,6 @@ class WordTextEncoder:
 
     @property
     def key(self) -> str:
-        """Identity of the embeddings."""
         return f"words-1-{self.dim}"
 
     def _vector(self, token: str) -> Tensor:
@@ -162,7 +161,6 @@ class WordTextEncoder:
         return torch.randn(self.dim, generator=torch.Generator().manual_seed(seed))
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return normalised embeddings (N, dim), float32."""
         rows = [torch.stack([self._vector(token) for token in self._tokens(text)]).sum(dim=0) for text in texts]
         return F.normalize(torch.stack(rows), dim=-1)
 
@@ -176,7 +174,6 @@ class LabelTextEncoder(WordTextEncoder):
 
     @property
     def key(self) -> str:
-        """Identity of the embeddings."""
         return f"labels-1-{self.dim}"
 
     def _tokens(self, text: str) -> list[str]:
@@ -191,12 +188,10 @@ class SiglipTextEncoder:
 
     @property
     def key(self) -> str:
-        """Identity of the embeddings: the model's name without its folder."""
         return f"siglip-{self.name.rstrip('/').rsplit('/', 1)[-1]}-{self.dim}"
 
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return pooled text features (N, dim), float32."""
         tokenizer, model = self._load()
         rows = []
         for part in itertools.batched(texts, 64):
