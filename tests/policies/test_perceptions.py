@@ -117,7 +117,7 @@ class Case:
         images = {} if OBS_ENV_STATE in row else self.images(index)
         return {**images, **numbers, **clock, "task": [dataset.meta.tasks.index[int(row["task_index"])]]}
 
-    def numbered_image(self, index: int) -> dict[str, Tensor]:
+    def images(self, index: int) -> dict[str, Tensor]:
         """Return the images of all cameras at a frame, (1, 3, H, W)."""
         episode = int(np.searchsorted(self.starts, index, "right")) - 1
         numbers = [index - self.starts[episode]]
