@@ -71,8 +71,8 @@ def prepare_lerobots_command(environment: Any) -> tuple[PreTrainedConfig | None,
     from lerobot_memobench.commands.command_line import PATH, parse_words, read_words
     from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY
     from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
+    from lerobot_memobench.policies.checkpoint import acting
     from lerobot_memobench.policies.compatibility import check_actions, chosen_convention
-    from lerobot_memobench.policies.lerobot_config import acting
     from lerobot_memobench.sim.convention import MIRRORED
 
     name = Path(sys.argv[0]).name.replace("_", "-")  # `lerobot-eval`, or `lerobot_eval.py` of `python -m`
