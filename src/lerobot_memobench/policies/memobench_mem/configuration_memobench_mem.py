@@ -482,7 +482,7 @@ class MemobenchMemConfig(PreTrainedConfig):
     def check_memory_reads(self) -> None:
         """Refuse a memory whose fusion cannot report how much a chunk reads of each remembered entry."""
         mechanism = self.mechanism
-        if mechanism is None or (mechanism.fusion is not None and not mechanism.fusion.reports_reads):
+        if mechanism is None or (mechanism.fusion is not None and not mechanism.fusion.watches):
             raise MemobenchError(
                 f"memory_reads=true is not available for memory={self.memory}, which has no attention weights; leave "
                 "it out"

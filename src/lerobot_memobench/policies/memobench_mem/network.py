@@ -34,10 +34,9 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     seed_parameters,
 )
 from lerobot_memobench.policies.memobench_mem.fusion import (
-    Context,
-    MemoryFusion,
+    ContextPass,
     MemoryPass,
-    Modulation,
+    ModulationPass,
     Prefix,
     attend,
     hidden,
@@ -53,7 +52,7 @@ from lerobot_memobench.policies.memobench_mem.sizes import Dimensions
 from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from lerobot_memobench.sim.object_slots import classes
 
-FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
+FUSIONS: dict[str, type[MemoryPass]] = {"modulation": ModulationPass, "context": ContextPass}
 OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
 """Prefixes of the names of further parameters that plain pi0.5 does not have, except for the memory's."""
 PERIODS = 4e-3, 4.0
@@ -88,7 +87,7 @@ class MemoryPI05(nn.Module):
     kept, and one over the actions for each step of denoising.
 
     Attributes:
-        memory: the memory mechanism. fusion: how actions read its tokens. None: plain pi0.5.
+        memory: the memory mechanism; None: plain pi0.5. fusion: how actions read its tokens.
         state_token: encodes the robot's state as a token; None: the text prompt spells the state.
         instruction: with a state token, maps the instruction to a condition of the action expert's norms.
     """
@@ -106,7 +105,7 @@ class MemoryPI05(nn.Module):
         self.state_token = StateToken(config.max_state_dim, vlm_width) if config.state_token else None
         self.instruction = InstructionCondition(vlm_width, width) if config.state_token else None
         self.memory: MemoryMechanism | None = None
-        self.fusion: MemoryFusion | None = None
+        self.fusion: type[MemoryPass] = MemoryPass
         if (mechanism := config.mechanism) is None:
             return
         observations = self.paligemma_with_expert.perception
@@ -121,11 +120,12 @@ class MemoryPI05(nn.Module):
         )
         pool, settings = mechanism.make_pool(observations, spec), mechanism.Settings(**config.memory_settings)
         self.memory = mechanism(spec, pool, settings)
-        self.fusion = (self.memory.fusion or FUSIONS[str(config.memory_fusion)])(self, vlm_width, width)
+        self.fusion = self.memory.fusion or FUSIONS[str(config.memory_fusion)]
+        self.fusion.extend(self, vlm_width, width)
 
     def memory_pass(self, memory: MemoryTokens | None, watched: bool = False) -> MemoryPass:
-        """Begin a pass over memory tokens; None: plain pi0.5. ``watched`` is as of `MemoryFusion.begin`."""
-        return MemoryPass() if self.fusion is None or memory is None else self.fusion.begin(memory, watched)
+        """Begin a pass over memory tokens; None: plain pi0.5. A ``watched`` one collects attention weights."""
+        return MemoryPass() if memory is None else self.fusion(self, memory, watched)
 
     # -- passes ------------------------------------------------------------------------------------------------------
 
@@ -238,8 +238,7 @@ class MemoryPI05(nn.Module):
 
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
-        parts = ("memory.",) if self.fusion is None else ("memory.", *self.fusion.parts)
-        return {name for name in self.state_dict() if name.startswith(parts)}
+        return {name for name in self.state_dict() if name.startswith(("memory.", *self.fusion.parts))}
 
 
 class StateToken(nn.Module):

@@ -139,7 +139,7 @@ class MemoryMechanism(nn.Module, ABC):
             is a thumbnail.
         ahead: number of following frames that training loads as labels.
         privileged: whether it learns from texts of checkpoints. A rollout gets the texts of its task, in no order.
-        fusion: its own `fusion.MemoryFusion` (``policy.memory_fusion=own``); None: any general one.
+        fusion: its own `fusion.MemoryPass` (``policy.memory_fusion=own``); None: any general one.
         gradient_frames: maximum number of last frames through which gradients pass.
         per_frame: whether memory tokens are P of each frame read, oldest first, as ``align=framewise`` needs.
         reads_text: whether memory tokens are words of a checkpoint's text; then no alignment is possible.

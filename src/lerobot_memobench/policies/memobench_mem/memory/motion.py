@@ -23,7 +23,7 @@ from einops import rearrange, reduce, repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Histories,
     MemoryMechanism,
@@ -74,34 +74,27 @@ class ForesightPass(MemoryPass):
     Queries and actions attend to each other. The queries shift the actions' positions by `FORESIGHT`.
     """
 
-    def __init__(self, expert: MotionExpert, memory: MemoryTokens) -> None:
-        super().__init__()
-        self.expert, self.hindsight = expert, expert.condition(memory.rows().squeeze(1))
+    parts = ("foresight.",)
+
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
+        pool = model.memory.pool
+        model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
+
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
+        self.expert: MotionExpert = model.foresight
+        self.hindsight: Tensor = self.expert.condition(memory.rows().squeeze(1))
 
     def actions(self, tokens: Tensor) -> Tensor:
         queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
         return torch.cat([queries, tokens], dim=1)
 
     def condition(self, condition: Tensor) -> Tensor:
-        hindsight: Tensor = self.hindsight
-        return condition + hindsight
+        return condition + self.hindsight
 
     def expert_states(self, states: Tensor) -> None:
         self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
-
-
-class Foresight(MemoryFusion):
-    """Let actions read hindsight, and predict the next motions (`ForesightPass`)."""
-
-    parts = ("foresight.",)
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        super().__init__(model, memory_dim, expert_dim)
-        pool = model.memory.pool
-        model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        return ForesightPass(self.model.foresight, memory)
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------
@@ -114,7 +107,7 @@ class Motion(MemoryMechanism):
     thumbnail. With fewer motions the earliest is repeated; at an episode's first frame the motion is zero.
     """
 
-    fusion = Foresight
+    fusion = ForesightPass
     stride = {"objects": 1, "pixels": 4}
     asks_motion = True
     ahead = FORESIGHT

@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 
@@ -88,12 +88,17 @@ class NarrowPass(MemoryPass):
     (B,), S: none).
     """
 
+    parts = ("subgoal.",)
     watches = ("prefix",)
 
-    def __init__(self, model: Any, memory: MemoryTokens, watched: bool) -> None:
-        super().__init__(watched)
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
+        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
+
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
         assert memory.query is not None
-        self.model, self.memory, self.query = model, memory, memory.query
+        self.memory, self.query = memory, memory.query
         self.choice: SubgoalChoice = model.subgoal
         self.chosen: Tensor | None = None
 
@@ -146,20 +151,6 @@ class NarrowPass(MemoryPass):
         return shares
 
 
-class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read only this text (`NarrowPass`)."""
-
-    reports_reads = True
-    parts = ("subgoal.",)
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        super().__init__(model, memory_dim, expert_dim)
-        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        return NarrowPass(self.model, memory, watched)
-
-
 class Subgoal(FrameSampling):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
@@ -169,7 +160,7 @@ class Subgoal(FrameSampling):
     """
 
     privileged = True
-    fusion = NarrowChannel
+    fusion = NarrowPass
 
     def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
         return super().read(state, query)._replace(query=query)
