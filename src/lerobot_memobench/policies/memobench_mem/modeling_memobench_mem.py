@@ -21,12 +21,7 @@ from lerobot_memobench.constants import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import (
-    as_trained,
-    check_as_trained,
-    check_processor_statistics,
-    check_weights,
-)
+from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_processor_statistics
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,
@@ -446,7 +441,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
                 check_as_trained(saved, config, of)
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
-        check_weights(source, trained, revision)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=has_another_memory(config, trained))
         load_weights(policy, path, source, trained)
         policy.to(config.device)

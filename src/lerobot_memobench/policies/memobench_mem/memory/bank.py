@@ -75,7 +75,7 @@ class Bank(MemoryMechanism):
         return state | {"count": torch.zeros(rows, dtype=torch.int64, device=device)}
 
     @torch.no_grad()
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         count = state["count"]
         written = {"count": (count + 1).clamp(max=self.capacity)}
         for name, present in self._present(tokens).items():
@@ -84,9 +84,8 @@ class Bank(MemoryMechanism):
             written[name], written[f"{name}_steps"] = append(entries, steps, count, fused.float(), step)
         return written
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the present fused with its retrieval: P perceptual tokens and one cognitive token."""
-        assert query is not None
         assert query.tokens is not None
         count, read, shares, steps = state["count"], [], [], []
         now = torch.zeros_like(count)  # used only with an empty bank, which no chunk reads

@@ -66,7 +66,7 @@ class FastWeights(MemoryMechanism):
             "steps": torch.full((rows, FRAMES_READ), -1, device=outputs.device),
         }
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Take a gradient step on the frame, apply the weights to it, and drop the oldest frame's output."""
         frame = self.encoder(tokens, step)
         layers = (self.query_norm, self.query), (self.key_norm, self.key), (self.value_norm, self.value)
@@ -103,7 +103,7 @@ class FastWeights(MemoryMechanism):
         unit = z * root
         return unit * (1 + self.scale) + self.shift, (unit, root)
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         tokens: Tensor = self.out(state["outputs"].flatten(1, 2))
         steps = repeat(state["steps"], "r f -> r (f p)", p=self.spec.tokens)
         return MemoryTokens(tokens, steps >= 0, steps=steps)

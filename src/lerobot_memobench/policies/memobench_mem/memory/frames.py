@@ -90,7 +90,7 @@ class FrameSampling(MemoryMechanism):
     def pooled(self, frames: Tensor) -> Tensor:
         return frames
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         if not self.warned and any(len(row) == self.capacity for row in state):
             self.warned = True
             logger.warning(
@@ -101,7 +101,7 @@ class FrameSampling(MemoryMechanism):
         new = [RememberedFrame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
         return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the encoded sampled frames of each row, padded to F."""
         count, device = self.settings.frames, self.encoder.project.weight.device
         rows = [[row[slot] for slot in sample_frames(len(row) - 1, count)] for row in state]
@@ -137,7 +137,7 @@ class FrameSampling(MemoryMechanism):
         seed = generator.initial_seed()
         return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Encode each frame once for all samples that read it."""
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)

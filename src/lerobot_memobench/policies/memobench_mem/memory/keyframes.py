@@ -105,9 +105,8 @@ class Keyframes(MemoryMechanism):
             "text": torch.full((rows,), self.count, device=like.device),
         }
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Keep the frame, run the high level, and count its nominations."""
-        assert query is not None
         assert query.choices is not None
         keyframes, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
         keyframe_at, old_at = state["steps"][:, :NOMINATED], state["steps"][:, NOMINATED:]
@@ -144,14 +143,14 @@ class Keyframes(MemoryMechanism):
         rows = torch.arange(len(keyframes), device=keyframes.device).unsqueeze(1)
         return keyframes[rows, chosen.clamp(min=0)], chosen >= 0
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         return MemoryTokens(*self.texts(state["text"]))
 
     # -- a training --------------------------------------------------------------------------------------------------
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Run the high level once per sample with true keyframes; without labels, replay a rollout."""
-        if histories.subgoals is None or query is None or query.subgoal is None:
+        if histories.subgoals is None or query.subgoal is None:
             return super().replay(histories, query)
         assert query.choices is not None
         labels = F.pad(histories.subgoals, (0, 1), value=-1)[histories.places]

@@ -176,7 +176,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the initial state of rows."""
 
     @abstractmethod
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Return the state after each row's next frame, without changing ``state``.
 
         ``tokens`` (R, P, D) are those of the frame, as of `pooled`; ``step`` (R,) counts since the episode began;
@@ -184,10 +184,10 @@ class MemoryMechanism(nn.Module, ABC):
         """
 
     @abstractmethod
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the tokens that a chunk reads, (R, L, d_m), with the same L for all states."""
 
-    def observe(self, state: State, frames: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def observe(self, state: State, frames: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Return the state after each row's next stored frame (R, P', D')."""
         return self.write(state, self.pooled(frames), step, query)
 
@@ -212,7 +212,7 @@ class MemoryMechanism(nn.Module, ABC):
         """Return which of an episode's frames 0 ... ``slot`` training loads to read at the last; by default all."""
         return range(slot + 1)
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Return what B samples read, equal to rollouts that wrote the same frames.
 
         All but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
@@ -235,7 +235,7 @@ class MemoryMechanism(nn.Module, ABC):
             state = self._written(state, histories, places, query, left, torch.arange(len(left), device=left.device))
         return self.read(state, query)
 
-    def _state_before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
+    def _state_before(self, histories: Histories, begin: Tensor, query: Query) -> State:
         """Return the states of B samples after the first ``begin`` (B,) frames of their histories.
 
         Each episode is written once, up to its latest sample.
@@ -251,11 +251,11 @@ class MemoryMechanism(nn.Module, ABC):
                 f"{type(self).__name__}.slots returns different sequences for samples of one episode with the same "
                 "first frame; the default replay needs prefixes of one sequence, so define your own replay"
             )
-        own = None if query is None else query.rows(latest)
-        return self._written(self.init(len(first)), histories, histories.places[latest], own, begin, episode)
+        places, own = histories.places[latest], query.rows(latest)
+        return self._written(self.init(len(first)), histories, places, own, begin, episode)
 
     def _written(
-        self, state: State, histories: Histories, places: Tensor, query: Query | None, stops: Tensor, row_of: Tensor
+        self, state: State, histories: Histories, places: Tensor, query: Query, stops: Tensor, row_of: Tensor
     ) -> State:
         """Write the frames of R rows, ``places`` (R, T); return the states of B samples on the way.
 
@@ -266,7 +266,7 @@ class MemoryMechanism(nn.Module, ABC):
         state, row_of, ends = _rows(state, order), order.argsort()[row_of], counts[order].tolist()
         needed, where = places[order].clamp(min=0).unique(return_inverse=True)
         pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
-        query, states, samples = None if query is None else query.rows(order), [], []
+        query, states, samples = query.rows(order), [], []
         for time in range(ends[0] + 1):
             samples.append((stops == time).nonzero().flatten())
             if len(samples[-1]):
@@ -274,8 +274,8 @@ class MemoryMechanism(nn.Module, ABC):
             going = sum(end > time for end in ends)
             state = _rows(state, slice(going))
             if going:
-                now, part = where[:going, time], None if query is None else query.rows(slice(going))
-                state = self.write(state, pooled[now], steps[now], part)
+                now = where[:going, time]
+                state = self.write(state, pooled[now], steps[now], query.rows(slice(going)))
         return _rows(self.join(states), torch.cat(samples).argsort())
 
     # -- losses -------------------------------------------------------------------------------------

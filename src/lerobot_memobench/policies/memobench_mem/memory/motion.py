@@ -147,7 +147,7 @@ class Motion(MemoryMechanism):
     def pooled(self, frames: Tensor) -> Tensor:
         return frames  # motion is found between stored frames
 
-    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
+    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query = Query()) -> dict[str, Tensor]:
         count, motions = state["frames"], state["motions"]
         moved = self.field.between(state["frame"].to(tokens.dtype), tokens).to(motions.dtype).unsqueeze(1)
         first, second = (rearrange(count == number, "r -> r 1 1 1") for number in (0, 1))
@@ -158,10 +158,10 @@ class Motion(MemoryMechanism):
     def noised(self, state: Any, generator: torch.Generator) -> dict[str, Tensor]:
         return {**state, "motions": with_noise(state["motions"], generator)}  # not the last frame
 
-    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: Any, query: Query = Query()) -> MemoryTokens:
         return self._encoded(state["motions"])
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Compute the motions of all samples at once, and the following motions as labels."""
         frames, places, field = histories.frames, histories.places, self.field
         exact = frames if histories.exact is None else histories.exact

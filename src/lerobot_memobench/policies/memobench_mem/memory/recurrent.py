@@ -77,7 +77,7 @@ class Recurrent(MemoryMechanism):
     def init(self, rows: int) -> State:
         return {"slots": repeat(self.initial, "s d -> r s d", r=rows)}
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         slots: Tensor = state["slots"]
         frame = self.encoder(tokens, step)
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
@@ -90,7 +90,7 @@ class Recurrent(MemoryMechanism):
         read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
         return {"slots": self.post_norm(self.attended(read) + slots)}
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         tokens: Tensor = self.out(state["slots"])
         return MemoryTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device))
 

@@ -162,10 +162,10 @@ class Subgoal(FrameSampling):
     privileged = True
     fusion = NarrowPass
 
-    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: Any, query: Query = Query()) -> MemoryTokens:
         return super().read(state, query)._replace(query=query)
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         return super().replay(histories, query)._replace(query=query)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
