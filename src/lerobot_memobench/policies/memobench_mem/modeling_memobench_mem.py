@@ -34,7 +34,6 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED, ObservationEncoder, VisualTokenEncoder
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.losses import (
     alignment_loss,
     counted_actions,
@@ -174,11 +173,17 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             if measures and self.config.privileged_memory:  # actions follow the memory's own choice
                 memory = self.read_memory(_without_labels(batch))
             memory_pass = self.model.memory_pass(memory)
-            per_sample, total, logged = self._action_loss(batch, memory_pass)
+            actions = pad_vector(batch[ACTION], self.config.max_action_dim)
+            drawn = noise_and_time(self.config.objective, actions)
+            squared = self.model.forward(self._observed(batch), actions, *drawn, memory_pass)[..., : self._action_dim]
+            losses = losses_of(self.config.objective, squared)
+            loss = mean_losses(losses, counted_actions(batch, losses))
+            per_sample, total = loss.per_sample, loss.mean
+            logged = {"action_loss": total.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
             own = {} if self.model.memory is None else self.model.memory.losses({**batch, **memory_pass.outputs})
-            for name, loss in own.items():
-                per_sample, total = per_sample + loss, total + loss.mean()
-                logged[f"memory_{name}_loss"] = loss.mean().item()
+            for name, of_memory in own.items():
+                per_sample, total = per_sample + of_memory, total + of_memory.mean()
+                logged[f"memory_{name}_loss"] = of_memory.mean().item()
             if self.alignment is not None and memory is not None:
                 assert self.model.memory is not None
                 encoder = [parameter for parameter in self.model.memory.parameters() if parameter.requires_grad]
@@ -219,16 +224,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             labels = batch[SUBGOAL][chosen].to(device) if SUBGOAL in batch else None
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)
         return query
-
-    def _action_loss(self, batch: dict[str, Tensor], memory: MemoryPass) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Return the action loss per sample (B,), its mean over the counted actions, and numbers to log."""
-        seen, actions = self._observed(batch), pad_vector(batch[ACTION], self.config.max_action_dim)
-        drawn = noise_and_time(self.config.objective, actions)
-        squared = self.model.forward(seen, actions, *drawn, memory)[:, :, : self._action_dim]
-        losses = losses_of(self.config.objective, squared)
-        loss = mean_losses(losses, counted_actions(batch, losses))
-        logged = {"action_loss": loss.mean.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
-        return loss.per_sample, loss.mean, logged
 
     # -- acting ----------------------------------------------------------------------------------------------------
 
