@@ -27,8 +27,14 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
-from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
-from lerobot_memobench.policies.lerobot_config import ELSEWHERE, encoded_config
+from lerobot_memobench.policies.checkpoint import (
+    ELSEWHERE,
+    SHIPPED,
+    WEIGHTS_FILE,
+    checkpoint_folder,
+    encoded_config,
+    shipped_policies,
+)
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.rollouts.card import git, training_facts
 from lerobot_memobench.tasks.catalogue import get_task, task_names

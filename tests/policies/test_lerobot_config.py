@@ -21,7 +21,7 @@ from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import read_runs
 from lerobot_memobench.policies.baselines import MemobenchRandomConfig
-from lerobot_memobench.policies.lerobot_config import acting, check_sizes
+from lerobot_memobench.policies.checkpoint import acting, check_sizes
 from lerobot_memobench.rollouts.shards import merge
 from lerobot_memobench.sim.object_layout import SIZE
 

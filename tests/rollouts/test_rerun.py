@@ -19,7 +19,7 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evalua
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.detector import SHIPPED
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
+from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import plan_line

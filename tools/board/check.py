@@ -24,7 +24,7 @@ from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
-from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.policies.checkpoint import tree_hash
 from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula

@@ -168,7 +168,7 @@ def cache(
     ] = None,
 ) -> None:
     """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
-    from lerobot_memobench.policies.lerobot_config import check_device, quiet
+    from lerobot_memobench.policies.checkpoint import check_device, quiet
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
     from lerobot_memobench.training.features import cache_dataset
 

@@ -39,9 +39,8 @@ from lerobot_memobench.datasets.layout import objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import check_weights
+from lerobot_memobench.policies.checkpoint import check_device, check_weights, quiet
 from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options

@@ -30,9 +30,8 @@ from lerobot_memobench.envs.observations import check_obs_type, obs_type_of
 from lerobot_memobench.envs.settings import INTACT, OBJECTS, PIXELS, SWAP
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, trained_names
+from lerobot_memobench.policies.checkpoint import check_as_trained, check_checkpoint, check_device, quiet, trained_names
 from lerobot_memobench.policies.compatibility import check_features, chosen_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.tasks.catalogue import NUM_STATES, check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
