@@ -30,8 +30,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, disagreement
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, refuse_links
-from lerobot_memobench.jobs.processes import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback, run_jobs
 from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.rollouts.card import card_of, extended
