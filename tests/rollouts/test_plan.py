@@ -26,11 +26,11 @@ from lerobot_memobench.rollouts.plan import (
     PlannedTask,
     RunOptions,
     Shard,
+    card_settings,
     make_plan,
     plan_line,
     take_run_options,
 )
-from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 from tests.support.logs import card

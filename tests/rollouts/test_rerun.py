@@ -22,7 +22,7 @@ from lerobot_memobench.perception.weights import SHIPPED
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.plan import EvaluationSettings, card_settings, plan_line
 from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
@@ -30,7 +30,6 @@ from lerobot_memobench.rollouts.rerun import (
     plan_of_evaluation,
     read_repeatable,
 )
-from lerobot_memobench.rollouts.settings import EvaluationSettings, card_settings
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 

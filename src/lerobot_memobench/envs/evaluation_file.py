@@ -153,7 +153,7 @@ class Start(TypedDict):
 
 
 class CardSettings(TypedDict, total=False):
-    """Settings of an evaluation that its protocol does not hold, see `rollouts.settings.EvaluationSettings`.
+    """Settings of an evaluation that its protocol does not hold, see `rollouts.plan.EvaluationSettings`.
 
     Attributes:
         env: other fields of `MemobenchEnvConfig`, such as tasks and videos.

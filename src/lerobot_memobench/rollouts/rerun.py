@@ -39,8 +39,16 @@ from lerobot_memobench.evaluation.records import SCENES, disagreements, other_ha
 from lerobot_memobench.policies.checkpoint import local_folder
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
 from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
-from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
+from lerobot_memobench.rollouts.plan import (
+    ENVIRONMENT,
+    OWN,
+    EvaluationPlan,
+    EvaluationSettings,
+    RunOptions,
+    Shard,
+    card_settings,
+    make_plan,
+)
 from lerobot_memobench.untrusted import Malformed, checked, parsed
 
 MOST_STEPS = 400 * HORIZON
