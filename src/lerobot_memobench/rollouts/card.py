@@ -14,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench.commands.command_line import without
 from lerobot_memobench.envs.evaluation_file import FORMAT, INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
@@ -64,7 +65,7 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         "task_files": {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks},
         "settings": plan.settings.portable,
         "shard": None if shard is None else str(shard),
-        "runs": joined_runs([run_facts(plan.command, plan.batch)]),
+        "runs": [{**run_facts(plan.command, plan.batch), "times": 1}],
     }
     return with_checkpoint(card, plan)
 
@@ -97,19 +98,12 @@ def with_checkpoint(card: dict[str, Any], plan: EvaluationPlan) -> dict[str, Any
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
-    """Return the facts that identify a policy apart from its weights.
-
-    They are its configuration as LeRobot encodes it, the seed of the run and, as a detector is not part of a
-    checkpoint, the detector's hash.
-    """
-    recorded = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
-    detector = detector_hash(recorded)
-    return {
-        "type": settings.get("type"),
-        "seed": seed,
-        "settings": recorded,
-        **({} if detector is None else {"detector_sha256": detector}),
-    }
+    """Return the facts that identify a policy apart from its weights: its configuration, seed and detector."""
+    recorded = without(settings, *ELSEWHERE, "type")
+    facts = {"type": settings.get("type"), "seed": seed, "settings": recorded}
+    if (detector := detector_hash(recorded)) is not None:  # a checkpoint does not contain the detector
+        facts["detector_sha256"] = detector
+    return facts
 
 
 def detector_hash(settings: Mapping[str, Any]) -> str | None:
@@ -124,8 +118,8 @@ def detector_hash(settings: Mapping[str, Any]) -> str | None:
 def training_facts(folder: Path) -> dict[str, Any] | None:
     """Return the dataset that a checkpoint was trained on, None where the checkpoint does not name it.
 
-    Where the dataset is on this machine, ``sha256`` is that of its meta files and its manifest, which in turn hold a
-    digest of every episode that `memobench generate` made.
+    ``sha256``, of a dataset on this machine, is that of its meta files and its manifest, which hold a digest of every
+    episode that `memobench generate` made.
     """
     try:
         config = read_json(folder / TRAIN_CONFIG, TrainConfig, "it is ignored")
@@ -172,10 +166,7 @@ def versions() -> dict[str, str]:
 def git_commit() -> str | None:
     """Return the commit of the checkout, with ``+changes`` where files of ``src`` differ; None outside a checkout."""
     package = Path(__file__).resolve().parents[1]
-    if not (package.parents[1] / ".git").exists():
-        return None
-    commit = git(package, "rev-parse", "HEAD")
-    if not commit:
+    if not (package.parents[1] / ".git").exists() or not (commit := git(package, "rev-parse", "HEAD")):
         return None
     return commit + ("+changes" if git(package, "status", "--porcelain", "--", str(package.parent)) else "")
 
@@ -197,8 +188,7 @@ def git(folder: Path, *words: str) -> str | None:
 def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
     """Return a card for two runs of one evaluation, with the extent, runs and task hashes of both.
 
-    Args:
-        again: whether an equal run is another start, or the same start read twice.
+    ``again``: whether an equal run is another start, or the same start read twice.
     """
     a, b = card["protocol"], other["protocol"]
     extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}

@@ -37,7 +37,6 @@ from lerobot_memobench.rollouts.card import card_of, extended
 from lerobot_memobench.rollouts.evaluate import (
     VIDEOS,
     Note,
-    check_folder,
     check_new,
     locked_folder,
     logged,
@@ -57,9 +56,8 @@ class ShardJob:
 
     Attributes:
         program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
-        words: the command line of the evaluation after ``lerobot eval``, without folders and run options.
-        out: folder of the evaluation.
-        directory: where relative paths are looked up.
+        words: the command line after ``lerobot eval``, without folders and run options.
+        out: folder of the evaluation. directory: where relative paths are looked up.
         at_once: parts that run at the same time.
     """
 
@@ -105,11 +103,7 @@ class ShardJob:
         return None
 
     def run(self) -> None:
-        """Run the part in a process of its own, which ends when this process does.
-
-        Raises:
-            MemobenchError: it failed, with its error message.
-        """
+        """Run the part in a process of its own, which ends when this process does; raise with its error message."""
         self.messages.parent.mkdir(parents=True, exist_ok=True)
         with self.messages.open("ab") as file:
             process = subprocess.Popen(
@@ -138,8 +132,7 @@ class ShardJob:
 def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> list[ShardJob]:
     """Return a job for each part of an evaluation, which starts ``program``.
 
-    Raises:
-        MemobenchError: there are more parts than batches, or the folders hold another evaluation.
+    More parts than batches, and folders that hold another evaluation are refused.
     """
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
     if options.shards > (batches := len(grid.cells())):
@@ -158,7 +151,6 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
         )
         for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
-    check_folder(out)
     if options.resume:
         card = card_of(plan)
         for folder in (out, *(job.folder for job in jobs)):
@@ -194,10 +186,8 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
 def _merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
     merge(out, folders)
     run = write_report(out)
-    if run.protocol[POLICY]:
-        return run
-    note = f"{out} does not name the policy of its episodes: no part did"
-    return replace(run, notes=[*run.notes, note])
+    notes = [] if run.protocol[POLICY] else [f"{out} does not name the policy of its episodes: no part did"]
+    return replace(run, notes=[*run.notes, *notes])
 
 
 def merge(out: Path, folders: Sequence[Path]) -> None:
@@ -210,15 +200,13 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
         MemobenchError: there are no parts, protocols or policies differ, a line contradicts them, a part does not name
             its policy where another does, or an episode ended differently in two parts.
     """
-    sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
+    sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     lines = {source: read_lines(source) for source in sources}
     cards = {source: read_evaluation(source) for source in sources}
-    logs = {source: joined(source, cards[source], lines[source]) for source in sources}
     card = _joined_card(cards)
-    records = join(logs)
-
+    records = join({source: joined(source, cards[source], lines[source]) for source in sources})
     refuse_links(out / VIDEOS, out / MEMORY_READS)
     for source in folders:
         if source != out:
