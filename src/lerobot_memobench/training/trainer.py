@@ -22,7 +22,7 @@ import pyarrow as pa
 import torch
 from lerobot.configs import FeatureType
 from lerobot.configs.train import TrainPipelineConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.utils.feature_utils import dataset_to_policy_features
 from torch import Tensor
@@ -36,7 +36,13 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs.processes import lock_refusal
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
-from lerobot_memobench.training.data import check_environment, complete_statistics, open_metadata, with_features
+from lerobot_memobench.training.data import (
+    check_environment,
+    complete_statistics,
+    downloaded,
+    open_metadata,
+    with_features,
+)
 from lerobot_memobench.training.features import cameras_of
 from lerobot_memobench.training.view import (
     SOURCE_EPISODE,
@@ -57,9 +63,6 @@ def prepare(
     Args:
         prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
         obs_type: kind of observation; None: images if the dataset has them, else objects.
-
-    Raises:
-        MemobenchError: the dataset lacks the observations, or is streamed from the hub.
     """
     config = copy.deepcopy(config)
     dataset, policy = config.dataset, config.policy
@@ -98,10 +101,7 @@ def prepare(
         }
     if not changed:
         return config
-    root = Path(meta.root)
-    if not (root / "data").is_dir():
-        root = Path(LeRobotDataset(dataset.repo_id, root=dataset.root, revision=dataset.revision).root)
-    folder = cached_view(root, options)
+    folder = cached_view(downloaded(dataset, meta), options)
     frames = "all frames" if options.prompts else "without the frames of prompts and holds"
     notify(f"LeRobot's trainer reads {folder}: {frames}, {options.obs_type or 'all observations'}")
     if dataset.episodes is not None:
@@ -185,30 +185,24 @@ def keep_in_memory(dataset: Any) -> None:
     reader: Any = dataset.reader
     names = [name for name in reader.hf_dataset.column_names if name not in dataset.meta.camera_keys]
     table = reader.hf_dataset.select_columns(names)
-    first, arrow = table[0], table.with_format("arrow")[:]
+    arrow = table.with_format("arrow")[:]
     columns: dict[str, Tensor] = {}
     texts: dict[str, pa.Array] = {}
-    for name, like in first.items():
+    for name, like in table[0].items():  # LeRobot's first row has the types and shapes
         column = arrow.column(name).combine_chunks()
-        if isinstance(like, Tensor):
-            columns[name] = _tensor(column, like)
-        else:
+        if not isinstance(like, Tensor):
             texts[name] = column.dictionary_encode() if pa.types.is_string(column.type) else column
+            continue
+        while isinstance(column, pa.ExtensionArray | pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+            column = column.storage if isinstance(column, pa.ExtensionArray) else column.flatten()
+        numbers = torch.from_numpy(column.to_numpy(zero_copy_only=False).copy())
+        columns[name] = numbers.to(like.dtype).reshape(len(table), *like.shape)
     # A reader may have some episodes only.
     starts = np.flatnonzero(np.diff(columns["episode_index"].numpy(), prepend=-1))
     bounds = np.append(starts, len(table))
     samples = SamplesInMemory(columns, bounds, reader.delta_indices or {}, dataset.meta.tasks.index.tolist(), texts)
     reader.get_item = samples.__getitem__
     dataset.__getitems__ = samples.__getitems__  # torch's loader asks for a batch at once
-
-
-def _tensor(column: Any, like: Tensor) -> Tensor:
-    """Return a column in the type and shape of LeRobot's first row."""
-    rows = len(column)
-    while isinstance(column, pa.ExtensionArray | pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
-        column = column.storage if isinstance(column, pa.ExtensionArray) else column.flatten()
-    numbers = torch.from_numpy(column.to_numpy(zero_copy_only=False).copy())
-    return numbers.to(like.dtype).reshape(rows, *like.shape)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """Write a view of a dataset for LeRobot's trainer: without prompt and held frames, and with columns of chosen inputs.
 
-LeRobot trains on all frames, including those of demonstration prompts and holds, in which actions have no effect. It
-uses every column that begins with ``observation`` as an input: images, object state, phase and step. A view is a
-LeRobotDataset v3.0 with a part of the frames and columns; its videos are links to the dataset's, or mirrored copies for
-another convention of images. Each part of an episode between two holds is an episode of the view, so that chunks of
-actions and windows of inputs end at a hold.
+LeRobot trains on all frames, also on those of prompts and holds, in which actions have no effect, and uses every column
+that begins with ``observation`` as an input: images, object state, phase and step. A view is a LeRobotDataset v3.0 with
+a part of the frames and columns; its videos are links to the dataset's, or mirrored copies for another convention of
+images. Each part of an episode between two holds is an episode of the view, so that chunks of actions and windows of
+inputs end at a hold.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from lerobot.configs import FeatureType
 from lerobot.utils.constants import OBS_IMAGES
 from PIL import Image, ImageOps
 
+from lerobot_memobench.commands.command_line import without
 from lerobot_memobench.constants import CAMERAS, CLOCK
 from lerobot_memobench.datasets.demonstration import LEVEL_COLUMNS
 from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
@@ -60,8 +61,7 @@ class ViewOptions:
 
     Attributes:
         prompts: whether the view has the frames of demonstration prompts and holds, and the clock.
-        obs_type: `envs.observations.OBS_TYPES`; None: all observations.
-        convention: of the images (`sim.convention`); None: the dataset's.
+        obs_type: None: all observations. convention: of the images (`sim.convention`); None: the dataset's.
     """
 
     prompts: bool = False
@@ -73,16 +73,14 @@ class ViewOptions:
         cameras = cameras_of(features)
         objects = [name for name in (PRIVILEGED, OBJECTS_COLUMN) if name in features][:1]
         dropped = set() if self.prompts else {*CLOCK}
-        if (self.obs_type in (OBJECTS, BOTH) and not objects) or (self.obs_type in (PIXELS, BOTH) and not cameras):
+        needed = {OBJECTS: [objects], PIXELS: [cameras], BOTH: [objects, cameras]}.get(self.obs_type or "", [])
+        if not all(needed):
             inputs = ", ".join(cameras + objects) or "neither images nor objects"
             raise MemobenchError(
                 f"found obs_type={self.obs_type}, and the dataset has {inputs}; choose another obs_type, or generate a "
                 "dataset that has it"
             )
-        if self.obs_type == OBJECTS:
-            dropped |= {*cameras}
-        if self.obs_type == PIXELS:
-            dropped |= {OBJECTS_COLUMN}
+        dropped |= {OBJECTS: {*cameras}, PIXELS: {OBJECTS_COLUMN}}.get(self.obs_type or "", set())
         renamed = {PRIVILEGED: OBJECTS_COLUMN} if self.obs_type in (OBJECTS, BOTH) else {}
         if self.mirrors(features):
             old, new = (CONVENTIONS[convention] for convention in (OTHER[str(self.convention)], str(self.convention)))
@@ -109,10 +107,9 @@ def view_options(
 ) -> ViewOptions:
     """Return the frames and inputs that a policy is trained on; a checkpoint keeps its inputs."""
     prompts = reads_prompt(policy) if prompt_frames is None else prompt_frames
-    begun = getattr(policy, "input_features", None) or {}
     if chooses_inputs(policy):
         return ViewOptions(prompts, None)
-    if begun:
+    if begun := getattr(policy, "input_features", None):
         images = any(feature.type is FeatureType.VISUAL for feature in begun.values())
         objects = OBJECTS_COLUMN in begun
     elif obs_type is not None:
@@ -139,10 +136,7 @@ def needs_view(features: Mapping[str, Any], options: ViewOptions) -> bool:
 
 
 def cached_view(root: Path, options: ViewOptions) -> Path:
-    """Return the view of a dataset in the cache folder; write it first if it is not there.
-
-    Its name has a hash of the options, and of the dataset's path, tables and metadata.
-    """
+    """Return the view of a dataset in the cache folder; write it first if it is not there."""
     digest = hashlib.blake2b(f"{root.resolve()} {options} {SOURCE_EPISODE}".encode(), digest_size=8)
     for path in (*files_below(root / "meta"), *files_below(root / "data", ".parquet")):
         digest.update(path.read_bytes())
@@ -153,11 +147,7 @@ def cached_view(root: Path, options: ViewOptions) -> Path:
 
 
 def write_view(root: Path, out: Path, options: ViewOptions) -> None:
-    """Write a view of the dataset in ``root``.
-
-    Raises:
-        MemobenchError: ``out`` exists, the dataset lacks the observations or is damaged, or the disk is full.
-    """
+    """Write a view of the dataset in ``root``; ``out`` must not exist."""
     if out.exists():
         raise MemobenchError(f"{out} exists already; name another folder, or delete it")
     info, table = read_info(root), read_frame_table(root)
@@ -183,13 +173,12 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
                 videos = build / "videos" / columns[name]
                 _write_videos(root / "videos" / name, videos, fps if mirrors else None)
                 if mirrors:
-                    new = {key: value for key, value in features[name].items() if key not in ("convention", "info")}
-                    new |= {"convention": stated} if stated else {}
+                    new = without(features[name], "convention", "info") | ({"convention": stated} if stated else {})
                     new |= {"info": video_info(files[0])} if (files := files_below(videos, ".mp4")) else {}
                     described[columns[name]] = new
         count = len(stretches.starts)
         info |= {"features": described, "total_episodes": count, "total_frames": int(stretches.lengths.sum())}
-        info["splits"] = {"train": f"0:{count}"}
+        info |= {"splits": {"train": f"0:{count}"}}
         write_file(build / INFO_FILE, json.dumps(info, indent=4))
         stats = {columns[name]: values for name, values in recorded(root).items() if name in columns}
         write_file(build / STATS_FILE, json.dumps(stats))
@@ -230,15 +219,8 @@ def _frames_of(rows: pa.Table, columns: Mapping[str, str], stretches: Stretches,
     wanted = (number >= 0) & (index < (stretches.starts + stretches.lengths)[number])
     rows, index, number = rows.filter(pa.array(wanted)).replace_schema_metadata(None), index[wanted], number[wanted]
     within = index - stretches.starts[number]
-    rows = _with_values(
-        rows,
-        {
-            "index": stretches.firsts[number] + within,
-            "episode_index": number,
-            "frame_index": within,
-            "timestamp": (within / fps).astype(np.float32),
-        },
-    )
+    changed = {"index": stretches.firsts[number] + within, "episode_index": number, "frame_index": within}
+    rows = _with_values(rows, {**changed, "timestamp": (within / fps).astype(np.float32)})
     if LANGUAGE in rows.column_names:
         texts = _earlier(rows.column(LANGUAGE).combine_chunks(), stretches.offsets[number] / fps)
         rows = rows.set_column(rows.column_names.index(LANGUAGE), LANGUAGE, texts)
@@ -267,19 +249,17 @@ def _mirrored(frames: pa.Table) -> pa.Table:
     """Return frames with LeRobot's images mirrored left to right, as PNG."""
     for number, field in enumerate(frames.schema):
         if field.name.startswith(OBS_IMAGES) and pa.types.is_struct(field.type):
-            rows = [{**row, "bytes": _mirrored_image(row["bytes"])} for row in frames.column(number).to_pylist()]
+            rows = frames.column(number).to_pylist()
+            for row in rows:
+                with Image.open(BytesIO(row["bytes"])) as image, BytesIO() as file:
+                    ImageOps.mirror(image).save(file, "PNG")
+                    row["bytes"] = file.getvalue()
             frames = frames.set_column(number, field, pa.array(rows, field.type))
     return frames
 
 
-def _mirrored_image(content: bytes) -> bytes:
-    with Image.open(BytesIO(content)) as image, BytesIO() as file:
-        ImageOps.mirror(image).save(file, "PNG")
-        return file.getvalue()
-
-
 def _write_videos(source: Path, out: Path, mirrored_at: int | None) -> None:
-    """Write a camera's videos: links to the dataset's, copies without support of links, or mirrored ones (frames/s)."""
+    """Write a camera's videos: mirrored ones (frames/s), or links to the dataset's."""
     for path in files_below(source, ".mp4"):
         target = out / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -289,7 +269,7 @@ def _write_videos(source: Path, out: Path, mirrored_at: int | None) -> None:
             continue
         try:
             target.symlink_to(path.resolve())
-        except OSError:
+        except OSError:  # a disk without links
             shutil.copyfile(path, target)
 
 
@@ -299,24 +279,20 @@ def _episodes_of(rows: pa.Table, columns: Mapping[str, str], stretches: Stretche
     chosen = np.flatnonzero(np.isin(stretches.sources, numbers))
     rows = rows.take(pa.array(np.searchsorted(numbers, stretches.sources[chosen])))  # they are in the order of numbers
     firsts, lengths = stretches.firsts[chosen], stretches.lengths[chosen]
-    changed = {
-        "episode_index": chosen,
-        "dataset_from_index": firsts,
-        "dataset_to_index": firsts + lengths,
-        "length": lengths,
-    }
+    changed = {"episode_index": chosen, "length": lengths}
+    changed |= {"dataset_from_index": firsts, "dataset_to_index": firsts + lengths}
     for name in rows.column_names:
         if name.endswith("/from_timestamp"):
             changed[name] = rows.column(name).to_numpy() + stretches.offsets[chosen] / fps
             changed[name.replace("/from_", "/to_")] = changed[name] + lengths / fps
-    names = [name for name in rows.column_names if not name.startswith("stats/")]
-    rows = rows.select([name for name in names if name != SOURCE_EPISODE])  # a view of a view has it
-    rows = _with_values(rows.append_column(SOURCE_EPISODE, rows.column("episode_index")), changed)
-    parts = [name.split("/") for name in rows.column_names]  # videos/<camera>/<place>
-    names = [
-        "/".join(columns.get(part, part) if at == 1 else part for at, part in enumerate(segments)) for segments in parts
-    ]
-    return rows.rename_columns(names).replace_schema_metadata(None)
+    # A view of a view has the column of source episodes already.
+    kept = [name for name in rows.column_names if not name.startswith("stats/") and name != SOURCE_EPISODE]
+    rows = rows.select(kept).append_column(SOURCE_EPISODE, rows.column("episode_index"))
+    names = []
+    for name in rows.column_names:  # videos/<camera>/<place>
+        section, *rest = name.split("/", 2)
+        names.append("/".join([section, columns.get(rest[0], rest[0]), *rest[1:]]) if rest else name)
+    return _with_values(rows, changed).rename_columns(names).replace_schema_metadata(None)
 
 
 def _write_table(table: pa.Table, path: Path) -> None:
