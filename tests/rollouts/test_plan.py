@@ -23,7 +23,6 @@ from lerobot_memobench.rollouts.card import card_of, run_facts
 from lerobot_memobench.rollouts.plan import (
     EvaluationPlan,
     Grid,
-    PlannedTask,
     RunOptions,
     Shard,
     card_settings,
@@ -302,7 +301,7 @@ def test_run_options_are_taken_out_of_the_arguments() -> None:
 
 
 def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:
-    return Grid(tuple(PlannedTask("temporal", k, Path(name)) for k, name in enumerate(tasks)), runs, batch, first)
+    return Grid(tuple(map(Path, tasks)), runs, batch, first)
 
 
 def test_batches_are_not_divided() -> None:

@@ -61,7 +61,7 @@ class FakeLoop:
                         raise Killed
                     self.kill_after -= 1
                 self.ran.append((name, episode))
-                log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
+                log.append(self.record(load_task(cell[0]), episode, plan.environment.seed_base + episode))
             advance(len(self.ran), len(self.ran), cell[0].name)
 
     def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:

@@ -42,10 +42,7 @@ def cores() -> int:
 
 
 def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int | None:
-    """Return the number of torch's threads in each of so many processes; None: torch's default.
-
-    ``large``: whether the acting policy has `LARGE` parameters or more.
-    """
+    """Return torch's threads in each of so many processes, for a policy of `LARGE` parameters or not; None: default."""
     if role == ACTING and not large:
         return 1
     if role == LEARNING and processes == 1 and cores() == len(_affinity()):

@@ -1,7 +1,4 @@
-"""The result card of an evaluation, ``evaluation.json``: everything needed to understand, repeat and check it.
-
-`evaluation_file.Card` lists its parts.
-"""
+"""The result card of an evaluation, ``evaluation.json`` (`evaluation_file.Card`): all that is needed to repeat it."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_memobench.commands.command_line import without
+from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.evaluation_file import FORMAT, INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
@@ -36,6 +34,7 @@ from lerobot_memobench.policies.lerobot_config import (
     tree_hash,
 )
 from lerobot_memobench.rollouts.plan import EvaluationPlan
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.untrusted import read_json
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
@@ -45,9 +44,6 @@ PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transform
 
 def card_of(plan: EvaluationPlan) -> dict[str, Any]:
     """Return the card of an evaluation that is about to begin. Hashes the checkpoint."""
-    from lerobot_memobench.datasets.generate import task_hash
-    from lerobot_memobench.tasks.catalogue import load_task
-
     environment, shard = plan.environment, plan.options.shard
     protocol = {
         "tasks": sorted(task.name for task in plan.grid.tasks),
@@ -62,7 +58,7 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         POLICY: policy_facts(encoded_config(plan.policy), plan.seed),
         "checkpoint": None,
         "trained_on": None,
-        "task_files": {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks},
+        "task_files": {task.name: task_hash(load_task(task)) for task in plan.grid.tasks},
         "settings": plan.settings.portable,
         "shard": None if shard is None else str(shard),
         "runs": [{**run_facts(plan.command, plan.batch), "times": 1}],
@@ -185,11 +181,15 @@ def git(folder: Path, *words: str) -> str | None:
 # --- cards joined ---
 
 
-def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
+def extended(card: Mapping[str, Any], other: Mapping[str, Any], folder: Path, *, again: bool = True) -> dict[str, Any]:
     """Return a card for two runs of one evaluation, with the extent, runs and task hashes of both.
 
-    ``again``: whether an equal run is another start, or the same start read twice.
+    Other task files than those of ``folder``, of one of the runs, are refused. ``again``: whether an equal run is
+    another start, or the same start read twice.
     """
+    for name, value in card["task_files"].items():
+        if other["task_files"].get(name, value) != value:
+            raise MemobenchError(f"the episodes of {name} in {folder} were run with other task files")
     a, b = card["protocol"], other["protocol"]
     extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}
     settings = card["settings"]

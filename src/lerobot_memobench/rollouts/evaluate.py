@@ -53,8 +53,6 @@ BatchCallback = Callable[[int, int, str], None]
 def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: BatchCallback) -> Run | None:
     """Run the missing episodes, write report and card; return None for a part that holds no episode.
 
-    A folder with another evaluation and missing weights are refused. Errors of LeRobot are raised.
-
     Args:
         note: called with notes, and with the command that resumes a run that breaks off.
         begin: called with a line on the evaluation before it starts.
@@ -97,11 +95,9 @@ def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: Batch
 
 
 def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: BatchCallback) -> None:
-    """Run batches of episodes; the environments write the log.
+    """Run batches of episodes, those of one task in succession; the environments write the log.
 
-    Args:
-        cells: the batches, those of one task in succession.
-        begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
+    ``begin`` is called after the policy is loaded and before the first scene; it writes the evaluation's file.
     """
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
@@ -127,7 +123,7 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     groups = itertools.groupby(cells, lambda cell: (cell[0], len(plan.grid.runs_of(cell[1]))))
     for (task, rows), group in groups:
         # Without settings of the user, each environment has a process of its own.
-        opened = open_environments(task.folder, rows, plan.settings.use_async_envs is not False)
+        opened = open_environments(task, rows, plan.settings.use_async_envs is not False)
         with amp, closing(opened) as env:
             for _, number in group:
                 runs = plan.grid.runs_of(number)
@@ -181,14 +177,12 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
             note(f"note: {folder} names no policy: whether its episodes are of this policy cannot be checked")
         return card
     require_whole(folder, earlier)
-    edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
-    if edited:
-        raise MemobenchError(f"the files of {edited[0]} differ from those that the episodes in {folder} were run with")
+    both = extended(earlier, card, folder)
     old, new = ({"batch_size": run["batch_size"], **run["versions"]} for run in (earlier["runs"][-1], card["runs"][-1]))
     changed = [f"{key} {old[key]}, now {new[key]}" for key in new if old.get(key, new[key]) != new[key]]
     for change in changed[: 1 + (old["batch_size"] != new["batch_size"])]:  # and the first version that differs
         note(f"note: numbers may depend on a change since the episodes in {folder}: {change}")
-    return extended(earlier, card)
+    return both
 
 
 def logged(folder: Path) -> set[Key]:
@@ -216,8 +210,7 @@ def check_folder(folder: Path) -> None:
 def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
     """Make and lock the folders of an evaluation and of its log, see `locked_folder`.
 
-    Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file. A link in
-    the place of the folder of videos or memory reads is refused.
+    Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file.
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():

@@ -89,28 +89,21 @@ WITHOUT_EFFECT = (f"env.{TYPE}", "job_name", "trust_remote_code")
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """An evaluation that is ready to run.
+    """An evaluation that is ready to run."""
 
-    Attributes:
-        settings: complete settings, equal to those of the card.
-        output: folder of the evaluation, or of its part (``shard=``).
-        log: folder of the episode log, the report and the card.
-        command: the typed command line, for the card.
-    """
-
-    settings: EvaluationSettings
+    settings: EvaluationSettings  # complete, equal to those of the card
     policy: PreTrainedConfig
     environment: MemobenchEnvConfig
     grid: Grid
-    output: Path
-    log: Path
+    output: Path  # folder of the evaluation, or of its part (``shard=``)
+    log: Path  # folder of the episode log, the report and the card
     options: RunOptions
-    command: tuple[str, ...]
+    command: tuple[str, ...]  # as typed, for the card
 
     @property
     def policy_path(self) -> str | None:
         """The model checkpoint or repository that is evaluated, None for a policy without weights."""
-        return self.settings.policy_path
+        return self.settings.policy.get("path")
 
     @property
     def seed(self) -> int:
@@ -140,7 +133,7 @@ class EvaluationPlan:
     @property
     def variants(self) -> dict[str, int]:
         """Task -> number of variants with which each of its scenes is run, with evidence."""
-        tasks = {task.name: load_task(task.folder).at(self.environment.difficulty) for task in self.grid.tasks}
+        tasks = {task.name: load_task(task).at(self.environment.difficulty) for task in self.grid.tasks}
         return {name: len(task.random_variants) for name, task in tasks.items()}
 
     @property
@@ -161,30 +154,16 @@ def with_changes(line: Sequence[str], **changes: object) -> list[str]:
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """Settings of an evaluation. None: the benchmark's default.
+    """Settings of an evaluation. None: the benchmark's default."""
 
-    Attributes:
-        env: fields of `MemobenchEnvConfig` by name.
-        policy: ``path`` of a checkpoint or ``type``, and settings of the policy's configuration.
-        seed: of the first episode of each task. episodes: of each task.
-        batch_size: environments at once. use_async_envs: whether each has a process of its own.
-        rename_map: LeRobot's: names of the environment's observations -> names of the policy's.
-        output_dir: folder of the evaluation; not part of the card.
-    """
-
-    env: Mapping[str, Any] = field(default_factory=dict)
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    seed: int | None = None
-    episodes: int | None = None
-    batch_size: int | None = None
-    use_async_envs: bool | None = None
-    rename_map: Mapping[str, str] = field(default_factory=dict)
-    output_dir: str | None = None
-
-    @property
-    def policy_path(self) -> str | None:
-        """The checkpoint or repository of the policy, None for a policy without weights."""
-        return self.policy.get("path")
+    env: Mapping[str, Any] = field(default_factory=dict)  # fields of `MemobenchEnvConfig`
+    policy: Mapping[str, Any] = field(default_factory=dict)  # ``path`` or ``type``, and settings of its configuration
+    seed: int | None = None  # of the first episode of each task
+    episodes: int | None = None  # of each task
+    batch_size: int | None = None  # environments at once
+    use_async_envs: bool | None = None  # whether each environment has a process of its own
+    rename_map: Mapping[str, str] = field(default_factory=dict)  # the environment's observations -> the policy's
+    output_dir: str | None = None  # not part of the card
 
     @property
     def portable(self) -> dict[str, Any]:
@@ -210,10 +189,9 @@ def card_settings(card: Mapping[str, Any]) -> EvaluationSettings:
 
 
 def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
-    """Return the settings that a command line, and the file that its ``config_path`` names, ask for.
+    """Return the settings of a command line and its configuration file; refuse unknown keys and values.
 
-    The scripted expert is evaluated where no policy is named. An unknown key or value is refused; the error names the
-    nearest known one.
+    The scripted expert is evaluated where no policy is named.
     """
     nested = read_words("eval", words).settings
     sections: dict[str, dict[str, Any]] = {}
@@ -253,22 +231,14 @@ def read_settings(words: Mapping[str, str]) -> EvaluationSettings:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of how an evaluation is run; they change no result.
+    """Options of how an evaluation is run; they change no result."""
 
-    Attributes:
-        split: the split whose seeds are run, one of `EVALUATED`; None: by `seed=`.
-        memory_reads: write the weight of each remembered frame in each chunk next to the log.
-        shard: run this part alone.
-        shards: run this many parts as jobs of their own, ``workers`` at a time, and merge them; 0: no parts.
-        workers: 0: as many as shards.
-    """
-
-    split: str | None = None
-    memory_reads: bool = False
+    split: str | None = None  # the split whose seeds are run; None: by ``seed=``
+    memory_reads: bool = False  # whether the weights of remembered frames are written next to the log
     resume: bool = False
-    shard: Shard | None = None
-    shards: int = 0
-    workers: int = 0
+    shard: Shard | None = None  # the part that is run alone
+    shards: int = 0  # number of parts that are run as jobs of their own, and merged
+    workers: int = 0  # parts at a time; 0: all
 
 
 def take_run_options(words: Mapping[str, str]) -> tuple[RunOptions, dict[str, str]]:
@@ -325,39 +295,18 @@ class Shard:
         return slice((self.number - 1) * length // self.count, self.number * length // self.count)
 
 
-@dataclass(frozen=True)
-class PlannedTask:
-    """A task of an evaluation: LeRobot's suite and number of it, and its folder."""
-
-    suite: str
-    number: int
-    folder: Path
-
-    @property
-    def name(self) -> str:
-        """Name in the catalogue."""
-        return self.folder.name
-
-
-Cell = tuple[PlannedTask, int]
-"""A batch: task, and number of the batch of that task."""
+Cell = tuple[Path, int]
+"""A batch: the task's folder, of its name in the catalogue, and the number of the batch of that task."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The episodes of an evaluation.
+    """The episodes of an evaluation. Run k is in batch k // ``batch`` of its task."""
 
-    Attributes:
-        tasks: in the order in which they are run.
-        runs: episodes of each task.
-        batch: environments at once; run k belongs to batch k // ``batch`` of its task.
-        first: episode of run 0 (0 in the benchmark's protocol).
-    """
-
-    tasks: tuple[PlannedTask, ...]
-    runs: int
-    batch: int
-    first: int = 0
+    tasks: tuple[Path, ...]  # their folders, in the order in which they are run
+    runs: int  # episodes of each task
+    batch: int  # environments at once
+    first: int = 0  # episode of run 0
 
     def cells(self, shard: Shard | None = None) -> list[Cell]:
         """Return the batches of a shard, or all. A batch is never divided: the policy acts on it as a whole."""
@@ -418,11 +367,11 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
     for name, value in vars(environment.settings_for(policy)).items():
         setattr(environment, name, value)
     settings = with_names(replace(settings, env={**settings.env, **environment.gym_kwargs}), environment)
-    tasks, runs, seed = environment.selected(), settings.episodes or 0, settings.seed or 0
+    runs, seed = settings.episodes or 0, settings.seed or 0
     if runs < 1:
         raise MemobenchError(f"found episodes={runs}; expected at least one episode")
-    planned = tuple(PlannedTask(*task) for task in tasks)
-    grid = Grid(planned, runs, min(settings.batch_size or 1, runs), seed - environment.seed_base)
+    tasks = tuple(folder for _, _, folder in environment.selected())
+    grid = Grid(tasks, runs, min(settings.batch_size or 1, runs), seed - environment.seed_base)
     plan = EvaluationPlan(settings, policy, environment, grid, output, log, options, tuple(command))
     for check in (check_policy_fits, check_corruption, check_split, check_scenes):
         check(plan)
@@ -446,7 +395,7 @@ def with_defaults(settings: EvaluationSettings, options: RunOptions, policy: Pre
     """Return settings with the protocol's seed and episodes, the policy's inputs, and videos."""
     env, seed, episodes = {**settings.env}, settings.seed, settings.episodes
     requested = env.get("convention") or (MIRRORED if env.get("camera_name_mapping") else None)
-    convention = chosen_convention(settings.policy_path, policy, requested, settings.rename_map)
+    convention = chosen_convention(settings.policy.get("path"), policy, requested, settings.rename_map)
     env |= {} if convention is None else {"convention": convention}
     if seed is None:
         seed = EVALUATION_SEED if options.split is None else SPLITS[options.split].start
@@ -497,15 +446,12 @@ def earlier_batch_size(log: Path) -> int | None:
 
 
 def _salt(options: RunOptions, log: Path) -> Any:
-    """Return a random salt for a sealed evaluation; a resumed one, or a part of it, keeps its salt.
-
-    A part that was started by itself has no salt and is refused: it would differ from that of the other parts.
-    """
+    """Return a random salt for a sealed evaluation; a resumed one, or a part of it, keeps its salt."""
     if options.resume:
         for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
             if has_evaluation(folder):
                 return read_evaluation(folder)["protocol"].get("salt")
-    if options.shard is not None:
+    if options.shard is not None:  # its salt would differ from that of the other parts
         raise MemobenchError(
             f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
             "part the same 32 random hexadecimal digits as salt="
@@ -515,10 +461,10 @@ def _salt(options: RunOptions, log: Path) -> Any:
 
 def with_names(settings: EvaluationSettings, environment: MemobenchEnvConfig) -> EvaluationSettings:
     """Return settings with the ``rename_map`` of the policy's training, as far as the environment has its names."""
-    if settings.policy_path is None or settings.rename_map:
+    if (path := settings.policy.get("path")) is None or settings.rename_map:
         return settings
     observed = environment.features_map.values()
-    names = {old: new for old, new in trained_names(settings.policy_path).items() if old in observed}
+    names = {old: new for old, new in trained_names(path).items() if old in observed}
     return replace(settings, rename_map=names)
 
 
@@ -526,10 +472,7 @@ def with_names(settings: EvaluationSettings, environment: MemobenchEnvConfig) ->
 
 
 def check_policy_fits(plan: EvaluationPlan) -> None:
-    """Refuse a policy whose inputs, settings or memory reads do not suit the evaluation.
-
-    A damaged checkpoint is refused, and one that was trained under other settings.
-    """
+    """Refuse a damaged checkpoint, and a policy whose inputs, settings or memory reads do not suit the evaluation."""
     policy, path = plan.policy, plan.policy_path
     if path is not None:
         check_checkpoint(path)

@@ -79,7 +79,7 @@ def repeat(
         say: called with differences of this machine, and with the result.
     """
     card, settings = read_repeatable(path, server)
-    check_policy(card, settings.policy_path)
+    check_policy(card, settings.policy.get("path"))
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_evaluation(card, settings, out)
@@ -105,11 +105,9 @@ def repeat(
 
 
 def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, Any], EvaluationSettings]:
-    """Return the card of an evaluation and its settings, checked by `allowed_settings`.
+    """Return the card in a file or a folder, and its settings, checked by `allowed_settings`.
 
-    Args:
-        path: the card's file or its folder.
-        server: address of the policy's server (``host:port``, or several with commas); the card's when None.
+    ``server``: address of the policy's server (``host:port``, or several with commas); the card's when None.
     """
     card = read_evaluation(path, whole=True)
     return card, allowed_settings(card_settings(card), server)
@@ -203,10 +201,7 @@ def allowed_settings(settings: EvaluationSettings, server: str | None = None) ->
 
 
 def _allowed_policy(policy: dict[str, Any], server: str | None) -> dict[str, Any]:
-    """Return the settings of a card's policy, checked; its checkpoint is a folder of this machine.
-
-    Of a repository, it is the copy in the hub's cache, without a download.
-    """
+    """Return the settings of a card's policy, checked; its checkpoint is a folder here, without a download."""
     for name in ("path", "type"):
         if not isinstance(value := policy.get(name), str | None):
             raise _refused(f"policy.{name}", value, "expected a name")

@@ -97,11 +97,9 @@ def plans_chunks(policy: Any) -> bool:
 
 
 class Actor:
-    """A policy of LeRobot's interface between its processors.
+    """A policy of LeRobot's interface between processors of observations and of actions.
 
-    Args:
-        before: processors of observations: the environment's, then the policy's.
-        after: processors of actions: the policy's, then the environment's.
+    The environment's are first for observations (``before``), the policy's for actions (``after``).
     """
 
     def __init__(

@@ -6,14 +6,12 @@ finished part is skipped.
 
 from __future__ import annotations
 
-import functools
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,22 +50,15 @@ LOGS = "logs"
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One part of an evaluation, as a job.
+    """One part of an evaluation, as a job."""
 
-    Attributes:
-        program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
-        words: the command line after ``lerobot eval``, without folders and run options.
-        out: folder of the evaluation. directory: where relative paths are looked up.
-        at_once: parts that run at the same time.
-    """
-
-    program: tuple[str, ...]
-    words: tuple[str, ...]
+    program: tuple[str, ...]  # arguments of Python for a process of ``lerobot`` that ends when its standard input does
+    arguments: tuple[str, ...]  # the command line of the part, after ``lerobot``
     shard: Shard
-    out: Path
+    out: Path  # folder of the evaluation
     episodes: frozenset[Key]
-    directory: Path
-    at_once: int
+    directory: Path  # where relative paths are looked up
+    at_once: int  # parts that run at the same time
 
     @property
     def folder(self) -> Path:
@@ -83,11 +74,6 @@ class ShardJob:
     def seed(self) -> int:
         """The part's number, which identifies the job."""
         return self.shard.number
-
-    @property
-    def arguments(self) -> list[str]:
-        """The command line of the part, after ``lerobot``."""
-        return ["eval", *self.words, f"output_dir={self.out}", f"shard={self.shard}", "resume=true"]
 
     @property
     def messages(self) -> Path:
@@ -142,7 +128,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            words=tuple(words),
+            arguments=("eval", *words, f"output_dir={out}", f"shard={shard}", "resume=true"),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
@@ -194,11 +180,7 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
     """Merge the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
     Episodes of ``out`` are kept. Videos and memory reads are hard links where the disk allows it, else copies;
-    LeRobot's own files are not merged. All checks are made before the first file is written.
-
-    Raises:
-        MemobenchError: there are no parts, protocols or policies differ, a line contradicts them, a part does not name
-            its policy where another does, or an episode ended differently in two parts.
+    LeRobot's own files are not merged. Before the first file is written, all differences between the parts are refused.
     """
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
@@ -247,14 +229,9 @@ def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
         return {"format": card["format"], "protocol": protocol, POLICY: card[POLICY]}
     for folder, part_card in cards.items():
         require_whole(folder, part_card)
-    whole = functools.reduce(partial(extended, again=False), cards.values())
-    for folder, part_card in cards.items():
-        for name, value in part_card["task_files"].items():
-            if whole["task_files"][name] != value:
-                raise MemobenchError(
-                    f"the episodes of {name} in {folder} were run with other task files than the others"
-                )
-    return whole
+    for folder, other in rest:
+        card = extended(card, other, folder, again=False)
+    return card
 
 
 def _share(source: Path, target: Path, pattern: str) -> None:
