@@ -154,8 +154,8 @@ def prepare_process() -> None:
     """
     _open_streams()
     choose_caches()
-    if sys.platform != "win32":
-        _shorten_temporary_folder()
+    if sys.platform != "win32" and len(os.fsencode(tempfile.gettempdir())) > LONGEST_TEMPORARY:
+        _shorten_temporary_folder(tempfile.gettempdir())
 
 
 def _open_streams() -> None:
@@ -173,11 +173,8 @@ def _open_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
-def _shorten_temporary_folder() -> None:
+def _shorten_temporary_folder(folder: str) -> None:
     """Name a long temporary folder by a short link: data loaders and worker processes place their sockets in it."""
-    folder = tempfile.gettempdir()
-    if len(os.fsencode(folder)) <= LONGEST_TEMPORARY:
-        return
     for shared in SHORT_FOLDERS:
         try:
             link = private_folder(shared) / hashlib.sha256(os.fsencode(folder)).hexdigest()[:8]
@@ -297,7 +294,9 @@ def locked(staging: Path, out: Path) -> Iterator[None]:
         raise MemobenchError(unsupported_system())
     descriptor = os.open(staging, os.O_RDONLY if staging.is_dir() else os.O_RDWR)
     try:
-        if not (_lock(descriptor) and _is_at(staging, descriptor)):
+        # The run that held the lock may have removed or replaced the folder since it was opened.
+        is_locked = _lock(descriptor) and staging.exists() and os.path.samestat(os.fstat(descriptor), staging.stat())
+        if not is_locked:
             raise HeldError(f"another run is writing to {out}; wait for it to end or name another folder")
         yield
     finally:
@@ -323,14 +322,6 @@ def note_missing_locks(reason: str) -> None:
         "command per folder",
         file=sys.stderr,
     )
-
-
-def _is_at(folder: Path, descriptor: int) -> bool:
-    """Return whether an open folder was neither removed nor replaced by the run that held the lock."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), folder.stat())
-    except FileNotFoundError:
-        return False
 
 
 def lock_refusal(error: BaseException) -> str | None:

@@ -332,11 +332,7 @@ class Grid:
 
 def plan_line(line: Sequence[str]) -> EvaluationPlan:
     """Return the plan of the benchmark's evaluation that ``lerobot eval <line>`` asks for."""
-    return plan_words(parse_words(line))
-
-
-def plan_words(words: Mapping[str, str]) -> EvaluationPlan:
-    """Return the plan of the benchmark's evaluation for the words of a command line."""
+    words = parse_words(line)
     options, setting_words = take_run_options(words)
     return make_plan(read_settings(setting_words), options, ("lerobot", "eval", *as_command_line(words)))
 
