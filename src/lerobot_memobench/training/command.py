@@ -76,8 +76,8 @@ READ = frozenset(
 )
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
-OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
-"""Beginnings of settings that a saved optimizer overrides."""
+FIXED = ("dataset.episodes", "dataset.revision", "optimizer.", "policy.optimizer_")
+"""Beginnings of settings that a resumed training keeps; a saved optimizer overrides its own."""
 NOT_COMPARED = {
     *("dataset.root", "dataset.repo_id", "log_freq", "num_workers", "output_dir", "resume", "save_freq", "steps")
 }
@@ -387,23 +387,17 @@ def check_same_training(
             + (f"if it is the same dataset, move it or link it to {before}; else " if moved else "")
             + f"leave it out, or {another}"
         )
-    for name in ("dataset.episodes", "dataset.revision"):
-        value, before = (attrgetter(name)(source) for source in (config, begun))
-        if value != before:
-            raise MemobenchError(
-                f"this training was begun with {name}={before}; found {value}; leave it out, or {another}"
-            )
     changed = []
-    for name in requested.words:
+    for name in ("dataset.episodes", "dataset.revision", *requested.words):
         try:
             value, before = (attrgetter(name)(source) for source in (config, begun))
         except AttributeError:  # a setting of another type of optimizer
             continue
         if name in NOT_COMPARED or value == before:
             continue
-        if name.startswith(OF_OPTIMIZER):
+        if name.startswith(FIXED):
             raise MemobenchError(
-                f"this training was begun with {name}={before}, which its saved optimizer keeps; found {value}; leave "
+                f"this training was begun with {name}={before}, which it keeps; found {value}; leave "
                 f"{name.removeprefix('policy.')} out, or {another}"
             )
         if not name.startswith("policy."):  # see `check_as_begun`

@@ -250,16 +250,12 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
         return
     table, level = read_frame_table(Path(meta.root)), config.subgoal_level
     levels = [name for name in LEVEL_COLUMNS if any(table.subgoals.get(name, []))]
+    lacks = f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}')"
     if config.align != NONE and level not in levels:
-        fix = (
-            f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
-            if levels
-            else "use --policy.align=none, or a dataset that has the subgoal of each frame there"
-        )
-        raise MemobenchError(
-            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), so "
-            f"--policy.align={config.align} has no text to align memory with; {fix}."
-        )
+        hint = "use --policy.align=none, or a dataset that has the subgoal of each frame there"
+        if levels:
+            hint = f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
+        raise MemobenchError(f"{lacks}, so --policy.align={config.align} has no text to align memory with; {hint}.")
     if config.oracle_memory and not any(table.memory or []):
         raise MemobenchError(
             f"The dataset {meta.root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
@@ -270,9 +266,8 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
     own = subgoals_of(table.subgoals.get(level, []), table.episodes, meta.episodes["tasks"])
     if not any(own.values()):
         raise MemobenchError(
-            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), from "
-            "which this memory learns; name a dataset of `memobench generate`, another policy.subgoal_level, or "
-            "another policy.memory."
+            f"{lacks}, from which this memory learns; name a dataset of `memobench generate`, another "
+            "policy.subgoal_level, or another policy.memory."
         )
     config.subgoals = config.subgoals or own
     if new := sorted({*texts_of(own)} - {*texts_of(config.subgoals)}):
