@@ -62,16 +62,11 @@ _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
 
 
 class Features(NamedTuple):
-    """An encoder of frames.
+    """An encoder of frames."""
 
-    Attributes:
-        key: identity of the encoder: weights and input size. size: numbers of a frame.
-        make: maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
-    """
-
-    key: str
-    size: int
-    make: Callable[..., Tensor]
+    key: str  # identity: weights and input size
+    size: int  # numbers of a frame
+    make: Callable[..., Tensor]  # maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16
 
 
 class EpisodeFeatures:

@@ -88,9 +88,8 @@ def prepare(
 ) -> TrainPipelineConfig:
     """Return the configuration for LeRobot's trainer, with a view of the dataset if it is needed.
 
-    Args:
-        prompt_frames: whether to train on prompt frames; None: if the policy reads prompts.
-        obs_type: kind of observation; None: images if the dataset has them, else objects.
+    Without ``prompt_frames``, prompts are trained on if the policy reads them; without ``obs_type``, images are if the
+    dataset has them, else objects.
     """
     config = copy.deepcopy(config)
     dataset, policy = config.dataset, config.policy
@@ -238,16 +237,11 @@ def keep_in_memory(dataset: Any) -> None:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """The frames and columns of a view.
+    """The frames and columns of a view."""
 
-    Attributes:
-        prompts: whether the view has the frames of demonstration prompts and holds, and the clock.
-        obs_type: None: all observations. convention: of the images (`sim.convention`); None: the dataset's.
-    """
-
-    prompts: bool = False
-    obs_type: str | None = None
-    convention: str | None = None
+    prompts: bool = False  # whether it has the frames of demonstration prompts and holds, and the clock
+    obs_type: str | None = None  # None: all observations
+    convention: str | None = None  # of the images; None: the dataset's
 
     def columns(self, features: Mapping[str, Any]) -> dict[str, str]:
         """Return name in the dataset -> name in the view; refuse a dataset that lacks the observations."""
@@ -365,19 +359,13 @@ def write_view(root: Path, out: Path, options: ViewOptions) -> None:
 
 
 class Stretches(NamedTuple):
-    """The S stretches of a dataset's episodes that are the episodes of a view.
+    """The S stretches of a dataset's episodes that are the episodes of a view; each array is (S,)."""
 
-    Attributes:
-        starts: (S,) first frame of each stretch in the dataset. lengths: (S,) number of its frames.
-        firsts: (S,) first frame in the view.
-        sources: (S,) its episode in the dataset. offsets: (S,) frames of that episode before it.
-    """
-
-    starts: np.ndarray
-    lengths: np.ndarray
-    firsts: np.ndarray
-    sources: np.ndarray
-    offsets: np.ndarray
+    starts: np.ndarray  # first frame in the dataset
+    lengths: np.ndarray  # number of frames
+    firsts: np.ndarray  # first frame in the view
+    sources: np.ndarray  # episode in the dataset
+    offsets: np.ndarray  # frames of that episode before the stretch
 
     @classmethod
     def of(cls, table: FrameTable, shortened: bool) -> Stretches:
