@@ -78,8 +78,7 @@ class WorkerKilledError(MemobenchError):
 def run_jobs(jobs: Sequence[Job], *, workers: int = 1, progress: ProgressCallback | None = None) -> None:
     """Run the jobs that are not finished yet, ``workers`` at a time; the same call continues a killed run.
 
-    ``progress`` is called after each job, first for those that were finished before. If a worker is killed, a
-    `WorkerKilledError` is raised.
+    ``progress`` is called after each job, first for those that were finished before.
     """
     finished: list[Job] = []
     waiting: list[Job] = []
@@ -214,7 +213,7 @@ def adding_resume_hint(program: str, how: Callable[[], str]) -> Iterator[None]:
 
     SIGTERM (a job is preempted, its time is up) ends this process and its descendants at once: all files on the disk
     are complete. The signal keeps its handler in other threads than the main one, and if it has another handler.
-    ``how`` returns the advice; an inner block replaces an outer one. A killed worker raises `WorkerKilledError`.
+    ``how`` returns the advice; an inner block replaces an outer one.
     """
     own = os.getpid()
 
@@ -287,10 +286,9 @@ class HeldError(MemobenchError):
 def locked(staging: Path, out: Path) -> Iterator[None]:
     """Lock ``out`` for one run at a time; take it before anything in ``out`` is written or removed.
 
-    The lock is on the folder or file ``staging`` itself, so no lock file remains. If another run holds it, a
-    `HeldError` is raised. Windows cannot lock folders, which is refused.
+    The lock is on the folder or file ``staging`` itself, so no lock file remains. `HeldError`: another run holds it.
     """
-    if sys.platform == "win32" and staging.is_dir():
+    if sys.platform == "win32" and staging.is_dir():  # Windows cannot lock folders
         raise MemobenchError(unsupported_system())
     descriptor = os.open(staging, os.O_RDONLY if staging.is_dir() else os.O_RDWR)
     try:

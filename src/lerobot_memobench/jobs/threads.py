@@ -1,12 +1,8 @@
 """Set the number of threads of this package's processes and their libraries.
 
-A rollout is sequential: a small policy, physics and both images use one core, and a second thread of torch or of the
-renderer only spins until the next step. So a process that simulates has one thread of each, and more cores mean more
-processes. Training and large policies multiply large matrices: they use all cores of their process, shared among this
-package's processes on the machine.
-
-`use_threads` sets environment variables before the libraries load; child processes inherit them. `limit_torch` sets
-torch's threads when a policy's size is known. Variables of the user are kept.
+A rollout is sequential: a second thread of torch or of the renderer only spins until the next step. So a process that
+simulates has one thread of each, and more cores mean more processes. Training and large policies multiply large
+matrices: they use all cores, shared among this package's processes. Variables of the user are kept.
 """
 
 from __future__ import annotations
@@ -58,7 +54,7 @@ def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int 
 
 
 def use_threads(role: str) -> None:
-    """Set this process's environment variables. Call it before numpy, torch or a renderer is loaded."""
+    """Set environment variables, which child processes inherit, before numpy, torch or a renderer is loaded."""
     environment = os.environ
     ours = set(filter(None, environment.get(CHOSEN_HERE, "").split(",")))
     wanted = dict(ONE_EACH)
