@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -86,9 +85,9 @@ def sharing_processes() -> int:
     return int(text) if text.isdecimal() and int(text) else 1
 
 
-def sharing(processes: int, environment: Mapping[str, str] | None = None) -> dict[str, str]:
+def sharing(processes: int) -> dict[str, str]:
     """Return the environment of one of so many processes that share the cores."""
-    return {**(os.environ if environment is None else environment), PROCESSES: str(processes)}
+    return {**os.environ, PROCESSES: str(processes)}
 
 
 def _affinity() -> set[int]:

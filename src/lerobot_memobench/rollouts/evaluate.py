@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +75,7 @@ def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: Batch
             begin(f"evaluating {policy} on {tasks}, {episodes} each, into {plan.output}")
             write_evaluation(plan.log, card)
             try:
-                evaluate(plan, cells, lambda: write_evaluation(plan.log, with_checkpoint(card, plan)), advance)
+                evaluate(plan, cells, card, advance)
             except BaseException:  # Ctrl-C too
                 if has_log(plan.log):
                     note(
@@ -94,11 +93,8 @@ def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: Batch
 # --- the loop ---
 
 
-def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: BatchCallback) -> None:
-    """Run batches of episodes, those of one task in succession; the environments write the log.
-
-    ``begin`` is called after the policy is loaded and before the first scene; it writes the evaluation's file.
-    """
+def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], card: dict[str, Any], advance: BatchCallback) -> None:
+    """Run batches of episodes, those of one task in succession; the environments write the log."""
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
     # As LeRobot's own command sets them, before it makes the policy.
@@ -107,17 +103,16 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     set_seed(plan.seed)
     actor = load_actor(plan)
     limit_torch(sum(parameter.numel() for parameter in actor.policy.parameters()))
-    begin()
+    card = with_checkpoint(card, plan)  # which the hub has delivered by now
+    write_evaluation(plan.log, card)
     # Logged rows of a resumed batch rest, and have no memory to swap.
     rests = plan.environment.corrupt != SWAP
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
-    facts = read_evaluation(plan.log)
-    by = Acting(facts[POLICY], facts["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
+    by = Acting(card[POLICY], card["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
     # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
     open_environments = environment.opener(actor.policy.config, by, plan.log)
     seeds = BatchSeeds(actor.policy, plan.seed)
-    scenes = environment.settings
-    reads = partial(noting_reads, plan.log, scenes) if plan.options.memory_reads else None
+    scenes, reads = environment.settings, plan.options.memory_reads
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
     done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
     groups = itertools.groupby(cells, lambda cell: (cell[0], len(plan.grid.runs_of(cell[1]))))
@@ -129,7 +124,8 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
                 runs = plan.grid.runs_of(number)
                 batch = range(plan.seed + runs.start, plan.seed + runs.stop)
                 seeds.begin(task.name, batch.start)
-                with nullcontext() if reads is None else reads(task.name, actor.policy, batch) as ended:
+                watched = noting_reads(plan.log, scenes, task.name, actor.policy, batch) if reads else nullcontext()
+                with watched as ended:
                     roll(env, actor, batch, ended, scenes.corrupt)
                 done += len(batch)
                 advance(done, total, task.name)

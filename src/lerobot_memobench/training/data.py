@@ -204,10 +204,10 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
 
 
 def open_lookup(
-    root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
+    root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str]
 ) -> FrameLookup:
     """Open the lookup of a dataset's frames; compute missing features of the policy's perception first."""
-    in_data = {known: name for name, known in (renamed or {}).items()}
+    in_data = {known: name for name, known in renamed.items()}
     columns: dict[str, Tensor] = {}
     encoded: dict[str, Encoded] = {}
     if isinstance(encoder, ImageTowerEncoder):
