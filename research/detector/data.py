@@ -16,8 +16,7 @@ from lerobot_memobench.datasets.generate import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, write_file
-from lerobot_memobench.jobs.processes import Advance
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, run_jobs
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 from lerobot_memobench.untrusted import read_json

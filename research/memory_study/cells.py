@@ -170,8 +170,7 @@ class Cell:
         Raises:
             MemobenchError: an unknown setting or value, with the nearest known one.
         """
-        from lerobot_memobench.rollouts.plan import take_run_options
-        from lerobot_memobench.rollouts.settings import read_settings
+        from lerobot_memobench.rollouts.plan import read_settings, take_run_options
 
         words = self.training_words()
         check_training(words)

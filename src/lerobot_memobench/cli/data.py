@@ -210,7 +210,7 @@ def view(
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.episodes import read_info
-    from lerobot_memobench.training.view import view_options, write_view
+    from lerobot_memobench.training.trainer import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)

@@ -124,9 +124,9 @@ def evaluate(words: Mapping[str, str]) -> int:
     suites = check_tasks(words)
     if len(suites) > 1:
         return evaluate_suites(suites, words)
-    from lerobot_memobench.rollouts.plan import plan_words
+    from lerobot_memobench.rollouts.plan import plan_line
 
-    plan = plan_words(words)
+    plan = plan_line(as_command_line(words))
     hint = f"resume with: {plan.resuming_command}"
     with (
         adding_resume_hint("lerobot", lambda: hint),

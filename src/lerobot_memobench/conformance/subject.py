@@ -185,7 +185,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_memobench.training.data import open_datasets, open_training
-    from lerobot_memobench.training.view import needs_view, view_options, write_view
+    from lerobot_memobench.training.trainer import needs_view, view_options, write_view
 
     raw = LeRobotDataset(repository, root=root)
     if not set(CLOCK) <= set(raw.meta.features):

@@ -48,8 +48,7 @@ from lerobot_memobench.io import (
     in_words,
     write_file,
 )
-from lerobot_memobench.jobs.processes import Advance, ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, ProgressCallback, run_jobs
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
 from lerobot_memobench.untrusted import Count, check_fetched, read_json, refusing

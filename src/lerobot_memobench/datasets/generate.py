@@ -36,8 +36,7 @@ from lerobot_memobench.datasets.write import assemble
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import explaining_disk_errors, free_bytes, in_words
-from lerobot_memobench.jobs.processes import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback, run_jobs
 from lerobot_memobench.jobs.threads import cores
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
