@@ -88,6 +88,7 @@ class Run:
 
     Attributes:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
+        card: content of its file; of the first one where several are joined.
         records: rollouts, each with the facts of its file. protocol: of the file, with the extent and ``policy``.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
@@ -98,6 +99,7 @@ class Run:
     name: str
     method: str
     folder: Path
+    card: Mapping[str, Any]
     records: Sequence[Record]
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
@@ -124,11 +126,6 @@ class Run:
     def evidence(self) -> EvidenceRates | None:
         """How often choices follow the evidence, None where scenes were not run with each variant."""
         return evidence_of(self.records)
-
-    @cached_property
-    def card(self) -> dict[str, Any]:
-        """Its file; of the first where several are joined."""
-        return read_evaluation(self.evaluations[0].folder)
 
     @cached_property
     def replan_steps(self) -> int | None:
@@ -281,7 +278,8 @@ def run_of(
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    return Run(name or folder.name, method, folder, records, protocol, [*notes, *notes_on(records)], missing, unrun)
+    notes += notes_on(records)
+    return Run(name or folder.name, method, folder, card, records, protocol, notes, missing, unrun)
 
 
 def _logged_extent(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
