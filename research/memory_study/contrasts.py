@@ -21,9 +21,9 @@ from lerobot_memobench.evaluation.statistics import (
     Array,
     Estimate,
     detectable,
-    difference_interval,
     holm,
     interval_of,
+    newcombe,
     sign_flip,
 )
 
@@ -67,7 +67,7 @@ def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str
     gap = _successes(runs, episodes, name) - base
     of_seeds = gap @ weights
     before = base.mean(axis=0)  # an episode counts once, however many policies were trained
-    low, high = difference_interval(_draws(gap, weights, tasks, rng), before, before + gap.mean(axis=0), weights)
+    low, high = interval_of(_draws(gap, weights, tasks, rng), newcombe(before, before + gap.mean(axis=0), weights))
     return SeedContrast(
         float(of_seeds.mean()),
         low,

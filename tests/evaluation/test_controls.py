@@ -10,7 +10,7 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.controls import oracle_share
+from lerobot_memobench.evaluation.comparison import oracle_share
 from lerobot_memobench.evaluation.report import with_labels_of
 from tests.support.logs import rollout, write_log
 

@@ -17,10 +17,9 @@ from lerobot_memobench.envs.evaluation_file import (
 )
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html import write_html
 from lerobot_memobench.evaluation.metrics import failure_counts, summary_of
-from lerobot_memobench.evaluation.records import read_run, read_runs, sweeps
+from lerobot_memobench.evaluation.records import headline, read_run, read_runs, sweeps
 from lerobot_memobench.evaluation.report import evaluation_report, failures_table, write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge

@@ -20,10 +20,9 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episodes, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import Rate, report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, line_style
-from lerobot_memobench.evaluation.records import Run, read_runs
+from lerobot_memobench.evaluation.records import Run, headline, read_runs
 from lerobot_memobench.evaluation.report import best_interval, evaluation_report, write_report
 from lerobot_memobench.evaluation.tables import (
     WIDTH,

@@ -1,7 +1,8 @@
 """Two evaluations of the same episodes, compared pair by pair: rates, differences with intervals, and tests.
 
-Episodes are paired by task, number and referent. Rates are fractions. Evaluations that differ in the setting of a
-control (`controls`) are that control: the setting may differ, and the report explains the difference.
+Episodes are paired by task, number and referent. Rates are fractions. Evaluations that differ on purpose in the setting
+of a control of memory (`CONTROLS`) are that control: the setting may differ, and the report explains the difference.
+Other controls are evidence, which needs one evaluation (`evidence`), and granularity (`report`).
 """
 
 from __future__ import annotations
@@ -15,11 +16,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
-from lerobot_memobench.envs.settings import SETTINGS
+from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, POLICY, differences
+from lerobot_memobench.envs.settings import INTACT, SETTINGS
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
-from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
@@ -35,14 +34,13 @@ from lerobot_memobench.evaluation.metrics import (
     satisfied,
     varies,
 )
-from lerobot_memobench.evaluation.records import SCENES, Run, other_draws, other_hashes, other_physics
+from lerobot_memobench.evaluation.records import SCENES, Run, headline, other_draws, other_hashes, other_physics
 from lerobot_memobench.evaluation.statistics import (
     DRAWS,
     PERMUTATIONS,
     Array,
     Estimate,
     detectable,
-    difference_interval,
     holm,
     interval_of,
     mcnemar,
@@ -57,7 +55,6 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    csv_text,
     percent_text,
     with_ids,
 )
@@ -69,6 +66,147 @@ ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
 
 Pair = tuple[Record, Record]
+
+
+# --- controls ---
+
+LEAST_GAP = 0.01
+"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
+
+
+@dataclass(frozen=True)
+class Control:
+    """A setting in which two evaluations differ on purpose.
+
+    Attributes:
+        setting: key of the protocol, or of the policy's settings where ``of_policy``.
+        default: its value in the first evaluation; the second has another.
+        meaning: how to read the difference.
+        of_policy: whether the policy's training, not the evaluation, has the setting.
+        one_policy: whether both evaluations have to be of one policy.
+        gap_closed: whether the share of the gap to 100 % is reported.
+        by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
+        value: the setting's only value that is the control; None: every value but the default.
+        also: settings that may differ as well, because they are parts of the control.
+    """
+
+    title: str
+    setting: str
+    default: Any
+    meaning: str
+    of_policy: bool = False
+    one_policy: bool = False
+    gap_closed: bool = False
+    by_checkpoint: bool = False
+    value: Any = None
+    also: tuple[str, ...] = ()
+
+    def value_in(self, run: Run) -> Any:
+        """Return the setting's value in an evaluation, the default where its log does not record it."""
+        known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
+        value = known.get(self.setting, self.default)
+        return value if self.value in (None, value) else self.default
+
+
+CONTROLS = (
+    Control(
+        "Pauses",
+        "pause_steps",
+        0,
+        "The robot rests at times that the seed draws. The policy observes and does the same, only later. A policy "
+        "that reads a clock loses; a policy that remembers events does not.",
+        one_policy=True,
+    ),
+    Control(
+        "Slower actions",
+        "speed",
+        1.0,
+        "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
+        "remembers events loses no more than the expert.",
+        one_policy=True,
+    ),
+    Control(
+        "Corrupted memory",
+        "corrupt",
+        INTACT,
+        "The memory of the second evaluation's policy was deleted, swapped or made noisy once, at corrupt_step. "
+        "Metrics that do not fall do not depend on the memory before that step. With reshow the evidence was shown "
+        "again: a policy that recovers falls less than without it.",
+        one_policy=True,
+        also=("corrupt_step", "reshow"),
+    ),
+    Control(
+        "Prompt shown again",
+        "reshow",
+        False,
+        "The demonstration prompt plays twice in the second evaluation. After a corruption of the memory, a gain is "
+        "the policy's recovery; without one, a change is the effect of the longer prompt alone.",
+        one_policy=True,
+    ),
+    Control(
+        "Interference",
+        "interference",
+        0,
+        "In the second evaluation the policy observes episodes of other tasks between prompt and execution, without "
+        "a reset. A memory of the latest frames loses the prompt; a memory that selects by the task keeps it.",
+        one_policy=True,
+    ),
+    Control(
+        "Oracle memory",
+        "oracle_memory",
+        False,
+        "The second policy reads the true memory content. Gap closed is (second − first) / (100 − first): the share "
+        "that a perfect memory would recover. It is left out where the gap is under one point.",
+        gap_closed=True,
+    ),
+    Control(
+        "Shuffled memory",
+        "align_targets",
+        "subgoals",
+        "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
+        "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
+        "satisfied.",
+        of_policy=True,
+        by_checkpoint=True,
+        value="shuffled",
+    ),
+)
+
+
+def control_between(a: Run, b: Run) -> Control | None:
+    """Return the control that two evaluations are, None where none of `CONTROLS` differs.
+
+    Raises:
+        MemobenchError: the evaluation with the control comes first, or they are of two policies.
+    """
+    for control in CONTROLS:
+        first, second = control.value_in(a), control.value_in(b)
+        if first == second:
+            continue
+        if first != control.default:
+            raise MemobenchError(
+                f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
+                f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
+            )
+        for key in ("type", "sha256") if control.one_policy else ():
+            of_a, of_b = (run.protocol[POLICY].get(key) for run in (a, b))
+            if of_a and of_b and of_a != of_b:
+                raise MemobenchError(
+                    f"{a.folder} and {b.folder} are of two policies ({key} {str(of_a)[:12]} and {str(of_b)[:12]}); "
+                    "expected one policy with and without the control"
+                )
+        return control
+    return None
+
+
+def oracle_share(first: float | None, second: float | None) -> float | None:
+    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
+
+    It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
+    """
+    if first is None or second is None or 1.0 - first < LEAST_GAP:
+        return None
+    return (second - first) / (1.0 - first)
 
 
 # --- pairs of rollouts ---
@@ -161,12 +299,9 @@ class Contrast:
     """One metric of B against A over the same episodes. Rates are fractions.
 
     Attributes:
-        kind: of the scope.
-        scope: the average, a memory type or suite of LIBERO, a task, or a family of tasks.
         metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
-        n: pairs.
-        a, b: rates of both evaluations.
-        interval: 95 % interval of b − a.
+        n: number of pairs.
+        a, b: rates of both evaluations. interval: 95 % interval of b − a.
         p: exact McNemar for outcomes of yes or no, sign-flip permutation else.
         exact: whether every assignment of signs was tried.
         detectable: smallest true difference that so many pairs show with 80 % power at 5 %; None for above 1.
@@ -361,7 +496,7 @@ def _contrast(
     drawn = np.mean([np.mean([sample.drawn for sample in group], axis=0) for group in groups], axis=0)
     # Summed as the report sums, so that both print the same digits.
     a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
-    d = after - before
+    bounds, d = newcombe(before, after, weights), after - before
     only_a = only_b = None
     if metric in PROCESS_METRICS:
         p, exact = sign_flip(d, weights, rng, permutations)
@@ -374,13 +509,13 @@ def _contrast(
         n=len(d),
         a=a,
         b=b,
-        interval=difference_interval(drawn[:, 1] - drawn[:, 0], before, after, weights),
+        interval=interval_of(drawn[:, 1] - drawn[:, 0], bounds),
         p=p,
         exact=exact,
         detectable=detectable(d, weights),
         only_a=only_a,
         only_b=only_b,
-        closed=_closed(a, b, drawn, newcombe(before, after, weights)) if closes else None,
+        closed=_closed(a, b, drawn, bounds) if closes else None,
     )
 
 
@@ -414,47 +549,33 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(comparison: Comparison) -> Report:
-    """Return a comparison as tables and JSON values."""
-    section = comparison_section(comparison)
-    title = f"{section.title}: {headline(comparison.runs)}"
-    return Report(title, [replace(section, title="")], comparison_data(comparison))
-
-
-def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
-    """Return the tables of a comparison, with a title; ``overall`` leaves tasks and families out."""
+def comparison_report(comparison: Comparison, overall: bool = False) -> Report:
+    """Return a comparison as tables and JSON values; ``overall`` leaves tasks and families out."""
+    shown = TABLES[: 1 if overall else None]
     kinds = {contrast.kind for contrast in comparison.contrasts}
-    tables = [_table(comparison, *spec) for spec in TABLES[: 1 if overall else None] if kinds & {*spec[2]}]
+    tables = [_table(comparison, *spec) for spec in shown if kinds & {*spec[2]}]
     if MEMORY_TYPE not in kinds:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
     sentence = f"{count_of(comparison.pairs, 'episode')} in both, paired by task, episode and referent."
     meaning = [comparison.control.meaning] if comparison.control else []
-    return Section(comparison.title, tables, [sentence, *meaning, NOTE], comparison.notes)
-
-
-def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
-    """Return a comparison as JSON values; ``overall`` leaves tasks and families out."""
-    kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
-    return {
+    title = comparison.title if overall else ""
+    section = Section(title, tables, [sentence, *meaning, NOTE], comparison.notes)
+    data = {
         "a": comparison.runs[0].name,
         "b": comparison.runs[1].name,
         "control": comparison.control.setting if comparison.control else None,
         "inputs": comparison.inputs,
         "pairs": comparison.pairs,
-        "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
+        "differences": [_entry(row) for row in comparison.contrasts if any(row.kind in spec[2] for spec in shown)],
         "notes": list(comparison.notes),
     }
+    return Report(f"{comparison.title}: {headline(comparison.runs)}", [section], data)
 
 
 def comparison_phrase(comparison: Comparison) -> str:
     """Return the change of the average success in words, for one line."""
     success = comparison.contrasts[0]
     return f"{comparison.title}: SR {_points(success.value, True)} {_interval(success)}"
-
-
-def comparison_csv(comparison: Comparison) -> str:
-    """Return all differences of a comparison as CSV, one a row."""
-    return csv_text([_entry(row) for row in comparison.contrasts])
 
 
 def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:

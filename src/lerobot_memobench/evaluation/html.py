@@ -29,7 +29,6 @@ from lerobot_memobench.envs.video import LAST_FRAMES, OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_phrase
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     SUITE,
     Rate,
@@ -40,7 +39,7 @@ from lerobot_memobench.evaluation.metrics import (
     operations,
     percent,
 )
-from lerobot_memobench.evaluation.records import Run, read_runs, unlike
+from lerobot_memobench.evaluation.records import Run, headline, read_runs, unlike
 from lerobot_memobench.evaluation.report import evaluation_report, outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import draft_of, file_name, refuse_links, write_file

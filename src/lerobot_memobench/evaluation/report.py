@@ -16,9 +16,8 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.errors import MemobenchError, count_of
-from lerobot_memobench.evaluation.comparison import comparison_data, comparison_section, controls_among
+from lerobot_memobench.evaluation.comparison import comparison_report, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
@@ -33,7 +32,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
     summary_of,
 )
-from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, headline, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
     Name,
@@ -93,11 +92,12 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
         sections += _sections(runs[0])
         data = evaluation_data(runs[0])
     else:
-        notes, controls, levels = unlike(runs), list(controls_among(runs)), granularity(runs)
+        notes, levels = unlike(runs), granularity(runs)
+        controls = [comparison_report(control, overall=True) for control in controls_among(runs)]
         sections = [
             Section("Evaluations", [evaluations_table(runs, notes), joined_table(runs)], notes=notes),
             *sections,
-            *(comparison_section(control, overall=True) for control in controls),
+            *(section for control in controls for section in control.sections),
             *([granularity_section(runs, levels)] if levels else []),
         ]
         for run in runs:
@@ -108,7 +108,7 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
             sections += [section, *evidence]
         data = {"evaluations": {run.name: evaluation_data(run) for run in runs}, "notes": notes}
         if controls:
-            data["controls"] = [comparison_data(control, overall=True) for control in controls]
+            data["controls"] = [control.data for control in controls]
         if levels:
             data["granularity"] = {
                 name: {"level": level, "own_labels": _percentages(own.average)} for name, (level, own) in levels.items()

@@ -26,6 +26,9 @@ EXACT_UP_TO = 16
 
 PERMUTATIONS = 10_000
 
+Array = NDArray[np.float64]
+Values = Sequence[float] | Array
+
 Z_POWER = 0.8416212335729143
 """Quantile of the normal distribution for 80 % power."""
 
@@ -36,11 +39,7 @@ _TOLERANCE = 1e-12
 
 
 def mcnemar(only_a: int, only_b: int) -> float:
-    """Return the exact two-sided p of McNemar's test: under the null, each discordant pair falls either way evenly.
-
-    Args:
-        only_a, only_b: pairs in which only one of both succeeded.
-    """
+    """Return the exact two-sided p of McNemar's test, given the pairs in which only one of both succeeded."""
     from scipy.stats import binomtest
 
     discordant = only_a + only_b
@@ -48,15 +47,12 @@ def mcnemar(only_a: int, only_b: int) -> float:
 
 
 def sign_flip(
-    differences: Sequence[float] | NDArray[np.float64],
-    weights: Sequence[float] | NDArray[np.float64],
-    rng: np.random.Generator,
-    permutations: int = PERMUTATIONS,
+    differences: Values, weights: Values, rng: np.random.Generator, permutations: int = PERMUTATIONS
 ) -> tuple[float, bool]:
     """Return the two-sided p of the weighted sum of differences under random signs, and whether it is exact.
 
-    Under the null, who is who in a pair is arbitrary. With at most ``EXACT_UP_TO`` pairs that differ, every assignment
-    of signs is looked at; else ``permutations`` random ones and the one observed, p = (1 + as extreme) / (1 + drawn).
+    With at most ``EXACT_UP_TO`` pairs that differ, every assignment of signs is looked at; else ``permutations`` random
+    ones and the one observed, p = (1 + as extreme) / (1 + drawn).
 
     `scipy.stats.permutation_test` refuses a single pair, misses sums that are equal but for rounding, and takes seven
     times as long.
@@ -79,9 +75,7 @@ def sign_flip(
     return (1 + extreme) / (1 + permutations), False
 
 
-def detectable(
-    differences: Sequence[float] | NDArray[np.float64], weights: Sequence[float] | NDArray[np.float64]
-) -> float | None:
+def detectable(differences: Values, weights: Values) -> float | None:
     """Return the smallest true difference that so many pairs show with 80 % power at 5 % two-sided; None for none.
 
     It is the δ with  n δ² = (1.96 √m + 0.84 √(m − δ²))²  (Connor 1987 for McNemar's test, where m is the share of
@@ -93,8 +87,7 @@ def detectable(
     """
     from scipy.optimize import brentq
 
-    d = np.asarray(differences, dtype=np.float64)
-    w = np.asarray(weights, dtype=np.float64)
+    d, w = np.asarray(differences, dtype=np.float64), np.asarray(weights, dtype=np.float64)
     if d.size < FEWEST_PAIRS:
         return None
     pairs = 1.0 / float(np.sum(w**2))
@@ -102,22 +95,16 @@ def detectable(
     square = (float(np.sum(w**2 * d**2)) * pairs * d.size + 1.0) / (d.size + 2.0)
 
     def missing(delta: float) -> float:
-        """How far a true difference is from being shown; 0 for the one that is looked for."""
         m = max(square, delta)
         spread = Z95 * math.sqrt(m) + Z_POWER * math.sqrt(max(0.0, m - delta * delta))
         return delta * math.sqrt(pairs) - spread
 
-    if missing(1.0) < 0:
-        return None
-    return float(brentq(missing, 0.0, 1.0))
+    return None if missing(1.0) < 0 else float(brentq(missing, 0.0, 1.0))
 
 
 def holm(values: Sequence[float]) -> list[float]:
-    """Return p-values adjusted for their number (Holm 1979), in the same order.
-
-    Written out: scipy has other procedures only.
-    """
-    p, order = np.asarray(values, dtype=np.float64), np.argsort(values)
+    """Return p-values adjusted for their number (Holm 1979), in the same order."""
+    p, order = np.asarray(values, dtype=np.float64), np.argsort(values)  # scipy adjusts by other procedures only
     adjusted = np.empty_like(p)
     adjusted[order] = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1)).clip(max=1.0)
     return [float(value) for value in adjusted]
@@ -126,8 +113,6 @@ def holm(values: Sequence[float]) -> list[float]:
 # --- bootstrap intervals ---
 
 DRAWS = 2000
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -145,20 +130,12 @@ def interval_of(draws: Array, bounds: tuple[float, float]) -> tuple[float, float
     return min(float(low), bounds[0]), max(float(high), bounds[1])
 
 
-def difference_interval(draws: Array, a: Array, b: Array, weights: Array) -> tuple[float, float]:
-    """Return the 95 % interval of a weighted mean of b − a: that of the bootstrap's draws, or the wider bound.
-
-    Args:
-        draws: (D,) of that mean. a, b: (n,) outcomes in [0, 1] of the same episodes. weights: (n,), their sum is 1.
-    """
-    return interval_of(draws, newcombe(a, b, weights))
-
-
 def newcombe(a: Array, b: Array, weights: Array) -> tuple[float, float]:
     """Return Newcombe's interval of a difference of paired rates, b − a (Statistics in Medicine 17, 1998, method 10).
 
-    It is made of both rates' Wilson intervals and the correlation of the pairs, which is corrected for continuity. The
-    number of trials is that of equal weights with the same standard error.
+    ``a`` and ``b``, (n,), are outcomes in [0, 1] of the same episodes; the ``weights`` sum to 1. The interval follows
+    from both rates' Wilson intervals and the correlation of the pairs, which is corrected for continuity. The number of
+    trials is that of equal weights with the same standard error.
     """
     n = 1 / float(np.sum(weights**2))
     p, q = float(weights @ a), float(weights @ b)
