@@ -82,12 +82,11 @@ class Control:
         setting: key of the protocol, or of the policy's settings where ``of_policy``.
         default: its value in the first evaluation; the second has another.
         meaning: how to read the difference.
-        of_policy: whether the policy's training, not the evaluation, has the setting.
         one_policy: whether both evaluations have to be of one policy.
-        gap_closed: whether the share of the gap to 100 % is reported.
+        gap_closed: whether `oracle_share` is reported.
         by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
         value: the setting's only value that is the control; None: every value but the default.
-        also: settings that may differ as well, because they are parts of the control.
+        also: other settings of the control, which may differ as well.
     """
 
     title: str
@@ -202,7 +201,7 @@ def control_between(a: Run, b: Run) -> Control | None:
 def oracle_share(first: float | None, second: float | None) -> float | None:
     """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
 
-    It is negative where the second is worse, and None where a rate does not apply or the gap is under `LEAST_GAP`.
+    None where a rate does not apply or the gap is under `LEAST_GAP`.
     """
     if first is None or second is None or 1.0 - first < LEAST_GAP:
         return None
@@ -236,8 +235,7 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
 
 
 def _common_episodes(a: Run, b: Run) -> list[Pair]:
-    """Return the rollouts of the same task and number; under different salts, of the same variant too."""
-    redrawn = other_draws(a, b)
+    redrawn = other_draws(a, b)  # another salt gives an episode another variant
 
     def key(record: Record) -> tuple[str, int, int | None]:
         return record["task"], record["episode"], record.get("variant") if redrawn else None
@@ -301,13 +299,13 @@ class Contrast:
     Attributes:
         metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
         n: number of pairs.
-        a, b: rates of both evaluations. interval: 95 % interval of b − a.
+        interval: 95 % interval of b − a.
         p: exact McNemar for outcomes of yes or no, sign-flip permutation else.
         exact: whether every assignment of signs was tried.
-        detectable: smallest true difference that so many pairs show with 80 % power at 5 %; None for above 1.
+        detectable: see `statistics.detectable`.
         only_a, only_b: pairs in which only one of both succeeded (SR and prefix completion only).
-        adjusted: p after Holm over the tasks, None but for tasks.
-        closed: share of the first's gap to 1 that the second closes; None where the comparison does not ask for it.
+        adjusted: p of a task after Holm over the tasks.
+        closed: `oracle_share`, where the control reports it.
     """
 
     kind: Kind
@@ -337,7 +335,6 @@ class Comparison:
 
     Attributes:
         runs: both, with these episodes alone.
-        notes: warnings for the reader.
         control: the control that they are, if any.
     """
 
@@ -369,7 +366,7 @@ def compare_evaluations(
     """Compare two evaluations over the episodes that both hold.
 
     Args:
-        allow: settings of the protocol (or "scene_hash") that are meant to differ; a control's setting always may.
+        allow: settings, of `ALLOWED`, that are meant to differ; a control's setting always may.
         seed: of the random signs.
 
     Raises:
@@ -444,10 +441,7 @@ def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
 
 
 def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]:
-    """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups.
-
-    Of a single suite of LIBERO, the average is that of the suite. LIBERO's tasks have no families.
-    """
+    """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups."""
     types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
     families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}
     types = [group for group in types if group]
@@ -524,10 +518,9 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
-    """Return the share of the gap that is closed, with its interval where the gap seldom vanishes in the draws."""
     value = oracle_share(a, b)
     shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
-    if value is None or len(shares) <= 0.9 * len(drawn):
+    if value is None or len(shares) <= 0.9 * len(drawn):  # the gap vanishes in too many draws for an interval
         return Estimate(value)
     low, high = interval_of(np.array(shares), (bounds[0] / (1.0 - a), bounds[1] / (1.0 - a)))
     return Estimate(value, low, min(high, 1.0))
@@ -627,8 +620,10 @@ def _p(value: float | None) -> Numbers:
 
 def _entry(row: Contrast) -> dict[str, Any]:
     """Return a difference as JSON values; rates in per cent, p as they are."""
-    number = libero_id(row.scope)
-    entry = {
+    number, closed = libero_id(row.scope), {}
+    if row.closed is not None:
+        closed = {"gap_closed": row.closed.value, "gap_closed_low": row.closed.low, "gap_closed_high": row.closed.high}
+    return {
         "kind": row.kind,
         "scope": row.scope,
         **({} if number is None else {"id": number}),
@@ -646,8 +641,5 @@ def _entry(row: Contrast) -> dict[str, Any]:
         "p": row.p,
         "p_holm": row.adjusted,
         "detectable": None if row.detectable is None else round(100 * row.detectable, 2),
+        **{name: percent(value) for name, value in closed.items()},
     }
-    if row.closed is None:
-        return entry
-    closed = {"gap_closed": row.closed.value, "gap_closed_low": row.closed.low, "gap_closed_high": row.closed.high}
-    return {**entry, **{name: percent(value) for name, value in closed.items()}}

@@ -62,12 +62,7 @@ class Evidence:
 
 
 class EvidenceRates(NamedTuple):
-    """The rates of an evaluation.
-
-    Attributes:
-        average: mean over memory types, None where no task has a chance.
-        notes: warnings for the reader.
-    """
+    """The rates of an evaluation; the average is the mean over memory types, None where no task has a chance."""
 
     tasks: dict[str, Evidence]
     memory_types: dict[str, Evidence]
@@ -86,10 +81,7 @@ class _Task(NamedTuple):
 
 
 def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
-    """Return how often choices follow the evidence; scenes that were not run with every variant are left out.
-
-    None unless scenes of a task were run with several variants.
-    """
+    """Return how often choices follow the evidence, None unless scenes of a task were run with several variants."""
     groups = _by_task(records)
     if not groups:
         return None
@@ -98,7 +90,10 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
     types: dict[str, list[_Task]] = {}
     left_out, without_rate = 0, list[str]()
     for name, group in groups.items():
-        whole = _whole_scenes(group)
+        scenes: dict[int, dict[int, Record]] = {}
+        for record in group:
+            scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
+        whole = [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
         left_out += len(group) - sum(map(len, whole))
         if not whole:
             without_rate.append(name)
@@ -129,13 +124,6 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
 
 def _by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     return by_task(record for record in records if "choice" in record and varies(record))
-
-
-def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
-    scenes: dict[int, dict[int, Record]] = {}
-    for record in group:
-        scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
-    return [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
 
 
 def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
@@ -215,7 +203,7 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 
 
 def evidence_section(evidence: EvidenceRates) -> Section:
-    """Return the tables of an evaluation in which each scene was run with each variant."""
+    """Return the tables of the rates."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
     rows = [_row(name, rates) for name, rates in evidence.memory_types.items()]
     of_tasks = [_row(Name(name), rates) for name, rates in evidence.tasks.items()]
@@ -233,7 +221,7 @@ def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:
 
 
 def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[str, Any]:
-    """Return the rates as JSON values, per cent, and of each task which variant was chosen how often."""
+    """Return the rates as JSON values, per cent, and how often each variant of a task was chosen."""
     groups = _by_task(records)
     return {
         "average": None if evidence.average is None else _data(evidence.average),
@@ -243,7 +231,7 @@ def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[st
 
 
 def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
-    """Return variant that was asked for -> variant that was chosen, or "none" -> rollouts."""
+    """Return variant of the scene -> chosen variant, or "none" -> rollouts."""
     choices: dict[str, Counter[str]] = {}
     for record in group:
         chosen = "none" if record["choice"] is None else str(record["choice"])

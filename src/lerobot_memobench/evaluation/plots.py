@@ -142,12 +142,7 @@ HEADING = 52
 
 
 class Bar(NamedTuple):
-    """One bar.
-
-    Attributes:
-        heading: memory type, written left of the first bar of a group. name: of the evaluation, "" for a single one.
-        parts: outcome -> rollouts, from the left.
-    """
+    """The outcomes of an evaluation, outcome -> rollouts, under the heading of a group of bars."""
 
     heading: str
     name: str
@@ -217,7 +212,17 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
     from matplotlib.lines import Line2D
 
     metrics = [*runs[0].summary.average]
-    methods = {name: _curves(group) for name, group in sweeps(runs).items()}
+    methods = {
+        name: {
+            metric: {
+                run.replan_steps: rate
+                for run in group
+                if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
+            }
+            for metric in metrics
+        }
+        for name, group in sweeps(runs).items()
+    }
     styles = {name: line_style(number, published=False) for number, name in enumerate(methods)}
     with paper_style():
         figure = new_figure(1.25 + 1.55 * len(metrics), 2.5)
@@ -234,17 +239,6 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
         figure.axes[0].set_ylabel("average, %")
         legend_below(figure, {name: Line2D([], [], **styles[name]) for name in methods}, 3)
         return figure
-
-
-def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
-    return {
-        metric: {
-            run.replan_steps: rate
-            for run in runs
-            if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
-        }
-        for metric in runs[0].summary.average
-    }
 
 
 def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) -> None:
@@ -264,17 +258,17 @@ GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
 
 
 def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
-    """Return for each group of gaps with checkpoints how many were reached, and how many there are.
-
-    A checkpoint counts if all earlier ones were reached in order: only then its information had to be remembered.
-    """
+    """Return for each group of gaps with checkpoints how many were reached, and how many there are."""
     samples = [sample for record in records for sample in _samples(record)]
     reached = {group: [done for gap, done in samples if low <= gap < high] for group, (low, high) in GAPS.items()}
     return {group: (sum(done), len(done)) for group, done in reached.items() if done}
 
 
 def _samples(record: Record) -> Iterator[tuple[int, bool]]:
-    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
+    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps.
+
+    Only where all earlier ones were reached in order, the information of a checkpoint had to be remembered.
+    """
     if suite_of(record["task"]) is None:
         return
     task = get_task(record["task"])
@@ -287,10 +281,7 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
 
 
 def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
-    """Draw the rate of reached checkpoints over their gap with Wilson's intervals, a line per evaluation.
-
-    ``by_gap`` maps its name to its `success_by_gap`.
-    """
+    """Draw the rate of reached checkpoints over their gap, given the `success_by_gap` of each evaluation."""
     from matplotlib.lines import Line2D
 
     groups = [group for group in GAPS if any(group in counts for counts in by_gap.values())]

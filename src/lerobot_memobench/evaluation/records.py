@@ -1,4 +1,4 @@
-"""Evaluations read back from their folders: the evaluation's file, rollouts, names.
+"""Evaluations read back from their folders: the evaluation's file, rollouts, names, and the headline of a report.
 
 An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
 replan intervals; without names, those of the same policy are. Evaluations of one policy in several suites of LIBERO are
@@ -30,13 +30,7 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 
 class Extent(NamedTuple):
-    """The episodes that an evaluation's file requests.
-
-    Attributes:
-        tasks: names, sorted.
-        episodes: numbers of the episodes of each task.
-        shard: part of the evaluation that the file belongs to, such as ``1/8``; None for all of it.
-    """
+    """The episodes that an evaluation's file requests; ``shard`` is its part of an evaluation, such as ``1/8``."""
 
     tasks: Sequence[str]
     episodes: range
@@ -70,12 +64,6 @@ def extent_of(card: Mapping[str, Any]) -> Extent | None:
     seed, base = card[POLICY].get("seed"), protocol.get("seed_base")
     first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
     return Extent(sorted({*protocol["tasks"]}), range(first, first + protocol["episodes"]), card.get("shard"))
-
-
-def requested(card: Mapping[str, Any], records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of a log without episodes that the evaluation's file does not ask for."""
-    extent = extent_of(card)
-    return [record for record in records if extent is None or extent.includes(record)]
 
 
 # --- evaluations ---
@@ -128,14 +116,13 @@ class Run:
         """How often choices follow the evidence, None where scenes were not run with each variant."""
         return evidence_of(self.records)
 
-    @cached_property
+    @property
     def replan_steps(self) -> int | None:
         """The one interval of all rollouts; the policy's own where none was asked for; None where it is unknown."""
-        logged = {record.get("replan_steps") for record in self.records}
-        if logged == {None}:
-            logged = {self.protocol[POLICY].get("settings", {}).get("n_action_steps")}
-        steps = logged.pop() if len(logged) == 1 else None
-        return steps if isinstance(steps, int) else None
+        steps = self.protocol.get("replan_steps")
+        if steps is None:
+            steps = self.protocol[POLICY].get("settings", {}).get("n_action_steps")
+        return steps if isinstance(steps, int) else None  # joined evaluations may have several
 
 
 def read_runs(words: Sequence[str | Path]) -> list[Run]:
@@ -149,7 +136,10 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     if not labelled:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
     names = folder_names([folder for _, folder in labelled])
-    runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(labelled, names, strict=True)]
+    runs = []
+    for (label, folder), name in zip(labelled, names, strict=True):
+        suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
+        runs.append(_joined([read_run(folder / suite, name, label or "") for suite in suites or ("",)]))
     first = runs[0].suites[0]
     for run in runs:
         if (suite := run.suites[0]) != first and not {suite, first} <= {*LIBERO_SUITES}:
@@ -157,23 +147,12 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
                 f"{runs[0].folder} is an evaluation of suite={first} and {run.folder} one of suite={suite}, whose "
                 "figures do not compare; report each suite by itself"
             )
-    return _with_methods(_with_suites_joined(runs))
-
-
-def _read_suites(folder: Path, name: str, method: str) -> Run:
-    """Return the evaluation in a folder; those in subfolders with names of LIBERO's suites are joined."""
-    suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
-    return _joined([read_run(folder / suite, name, method) for suite in suites] or [read_run(folder, name, method)])
-
-
-def _with_suites_joined(runs: Sequence[Run]) -> Sequence[Run]:
-    """Join the evaluations of one policy, or of one given name, where evaluations are of different suites of LIBERO."""
-    if len({run.suites for run in runs}) == 1:
-        return runs
-    groups: dict[Any, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.method or (*_policy(run), run.replan_steps), []).extend(run.evaluations)
-    return [_joined(group) for group in groups.values()]
+    if len({run.suites for run in runs}) > 1:
+        groups: dict[Any, list[Run]] = {}
+        for run in runs:
+            groups.setdefault(run.method or (*_policy(run), run.replan_steps), []).extend(run.evaluations)
+        runs = [_joined(group) for group in groups.values()]
+    return _with_methods(runs)
 
 
 def _joined(parts: Sequence[Run]) -> Run:
@@ -268,25 +247,23 @@ def run_of(
 ) -> Run:
     """Return the evaluation in a folder, given the lines of its log and the notes of reading them; see `read_run`."""
     card, notes = read_evaluation(folder), [*notes]
-    records, extent = requested(card, joined(folder, card, lines)), extent_of(card)
+    extent, records = extent_of(card), joined(folder, card, lines)
+    records = [record for record in records if extent is None or extent.includes(record)]
     if len(records) < len(lines):
         notes.append(f"{count_of(len(lines) - len(records), 'rollout')} beyond those that were asked for left out")
     missing = None if extent is None else extent.missing(records)
     notes += [*([] if missing is None else [missing]), *notes_on_not_run(records)]
     unrun = {task: len(group) for task, group in not_run(records).items()}
-    protocol = {**_logged_extent(lines), **card["protocol"], POLICY: card[POLICY]}
+    # A file that requests no episodes has the extent of its log; larger numbers are damage.
+    numbers = (line["episode"] + 1 for line in lines if line["episode"] < MOST_EPISODES)
+    logged = {"tasks": sorted({line["task"] for line in lines}), "episodes": max(numbers, default=0)}
+    protocol = {**logged, **card["protocol"], POLICY: card[POLICY]}
     records = [record for record in records if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
     notes += notes_on(records)
     return Run(name or folder.name, method, folder, card, records, protocol, notes, missing, unrun)
-
-
-def _logged_extent(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the tasks and the number of episodes of a log, for files that do not request them."""
-    numbers = (line["episode"] + 1 for line in lines if line["episode"] < MOST_EPISODES)  # larger ones are damage
-    return {"tasks": sorted({line["task"] for line in lines}), "episodes": max(numbers, default=0)}
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -359,7 +336,7 @@ PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (n
 
 
 def headline(runs: Sequence[Run]) -> str:
-    """Return the first line of a report of one or several evaluations."""
+    """Return the first line of a report: policy, protocol and the policy's inputs of each evaluation."""
     if len(runs) == 1:
         (run,) = runs
         return f"{policy_name(run)}: {', '.join(protocol_phrases(run))}; {inputs_of(run)}"
@@ -446,11 +423,7 @@ OUTCOME = (
 
 
 def disagreement(
-    a: Mapping[str, Any],
-    b: Mapping[str, Any],
-    here: str,
-    there: str,
-    ignore: Collection[str] = (),
+    a: Mapping[str, Any], b: Mapping[str, Any], here: str, there: str, ignore: Collection[str] = ()
 ) -> str | None:
     """Return a phrase for the first difference of two records of the same episode, None where they agree.
 
