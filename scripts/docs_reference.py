@@ -343,7 +343,6 @@ def typed_rows(kind: Any) -> list[list[str]]:
 
 
 PROTOCOL_ONLY = {
-    "world": "`libero`; absent for the scenes of version 0.2, a list for a log of both",
     "hold": "mean of the drawn holds of a strict task, control steps",
     "goals": "revision of the goals of strict tasks",
     "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",

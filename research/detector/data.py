@@ -44,11 +44,7 @@ KINDS_FILE = "kinds.json"
 
 
 class Pictures:
-    """Labelled images of several files as one, read from the disk as they are asked for.
-
-    Raises:
-        MemobenchError: a file holds no labelled images of this version.
-    """
+    """Labelled images of several files as one, read from the disk as they are asked for."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         self._files = [_read(file) for file in files]
@@ -78,12 +74,7 @@ def _read(file: Path) -> Rows:
 
 @dataclass(frozen=True)
 class DetectorData:
-    """Which images are made.
-
-    Attributes:
-        names: of tasks. first_seed: of the episodes. episodes: of each task. frames: of each episode, `PER_FRAME`
-            images each. workers: processes.
-    """
+    """Images to make: ``frames`` of each episode, `PER_FRAME` images each, by so many ``workers``."""
 
     names: Sequence[str]
     first_seed: int
@@ -169,10 +160,7 @@ class ExpertState:
 
 
 def expert_states(episode: Episode, seed: int, count: int) -> list[ExpertState]:
-    """Play the perturbed expert in the episode of a seed, demonstration prompt and all, and return ``count`` states.
-
-    Fewer of a short episode.
-    """
+    """Play the perturbed expert in the episode of a seed, prompt and all; return at most ``count`` states."""
     rng = generator(episode.published, seed, STATE_STREAM)
     episode.reset(seed)
     perturbation, states = Perturbation(rng), []
@@ -195,8 +183,6 @@ def _state(episode: Episode) -> ExpertState:
 
 
 class _Scenes:
-    """One episode's scene, as it is and with distractors."""
-
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         self._sim, self._crowd = sim, with_distractors(sim, rng)
         self._fixed = sim.fixture_poses()

@@ -50,9 +50,6 @@ def evaluate(file: Path, folder: Path, pictures: Callable[[], Pictures]) -> str:
 
     Args:
         pictures: makes the labelled images, both cameras' of each frame one after the other.
-
-    Raises:
-        MemobenchError: the file holds no detector, or one of other kinds.
     """
     detector = load_detector(file)
     if detector.kinds != kinds():
@@ -101,7 +98,6 @@ def outcomes(localise: Localise, pictures: Pictures) -> tuple[Outcomes, Outcomes
 def _frame_outcomes(
     rows: Rows, found_kinds: NDArray[np.int64], found_at: NDArray[np.float64], lit: NDArray[np.bool_]
 ) -> tuple[Outcomes, Outcomes]:
-    """Return the outcomes of one frame, and its false detections."""
     shown = [one for row in rows for one in row["things"][: row["count"]]]
     true = {(int(one["kind"]), *one["position"]): one for one in shown}
     visible = {(int(one["kind"]), *one["position"]) for one in shown if one["pixels"] >= VISIBLE}
@@ -168,7 +164,6 @@ def figures(found: Outcomes, false: Outcomes) -> list[dict[str, Any]]:
 
 
 def _percentile(values: NDArray[Any], percent: int) -> float | None:
-    """Return a percentile, None if it is infinite."""
     found = float(np.percentile(values, percent, method="higher"))
     return round(found, 4) if math.isfinite(found) else None
 

@@ -117,7 +117,6 @@ class DomainRandomisation:
         settle(self._sim)
 
     def _put(self, name: str) -> None:
-        """Put an object on the table, on or into something, or away."""
         rng, asset = self._rng, self._objects[name]
         if rng.random() < ABSENT:
             self._take_away(name)
@@ -166,7 +165,6 @@ class DomainRandomisation:
         return reach(sim, place, tilt.as_matrix() @ downward(yaw + rng.choice([0.0, np.pi])))
 
     def _hold(self, name: str) -> None:
-        """Put an object between the fingers."""
         grasps, rng = self._objects[name].grasps, self._rng
         if not grasps:
             return
@@ -202,7 +200,6 @@ class DomainRandomisation:
         return {name for pair in pairs if pair != {held, ARM} for name in pair} - {"world", held}
 
     def _root(self, body: int) -> str:
-        """The name of the root of a body's tree: an instance, or the arm."""
         model = self._sim.model
         return str(model.body(model.body_rootid[body]).name)
 

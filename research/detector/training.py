@@ -111,9 +111,6 @@ def train(
     Args:
         pictures: labelled images. kinds: names of the objects in them. folder: for checkpoint, losses and weights.
         encoder: makes the one to train. save_every: updates between two checkpoints.
-
-    Raises:
-        MemobenchError: the folder's training has other settings.
     """
     folder.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
@@ -157,8 +154,6 @@ class TokenHeads(nn.Module):
 
 
 class _Trainer:
-    """A detector with its optimizer, its place in the run and its losses."""
-
     def __init__(self, model: TokenHeads, settings: Training, pictures: int) -> None:
         self.model, self._settings, self._pictures = model, settings, pictures
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -236,10 +231,7 @@ def train_last(
     checkpoint: Path | None = None,
     save_every: int = 50,
 ) -> None:
-    """Train expected errors and refinement head of a trained detector; all else in it stays as it is.
-
-    It resumes from a checkpoint, if there is one.
-    """
+    """Train expected errors and refinement head of a trained detector, or resume this; all else in it stays."""
     detector.eval().requires_grad_(False)
     uncertainty, refinement = detector.fine_heads.uncertainty, detector.refinement_head
     assert uncertainty is not None
@@ -279,7 +271,6 @@ def train_last(
 
 
 def _sample(pictures: Pictures) -> Iterator[Tensor]:
-    """Yield batches of images from all over."""
     chosen = np.linspace(0, len(pictures) - 1, min(len(pictures), WHITENING_IMAGES)).astype(np.int64)
     for indices in np.array_split(chosen, -(-len(chosen) // BATCH)):
         yield images_of(pictures.rows(indices))
@@ -298,7 +289,6 @@ def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 
 def _generator(settings: Training, update: int) -> torch.Generator:
-    """Return the generator of an update's augmentation."""
     return torch.Generator().manual_seed(settings.seed * 2**32 + update)
 
 
@@ -411,11 +401,7 @@ def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:
 
 
 def uncertainty_loss(output: DetectorOutput, wanted: Targets) -> Tensor:
-    """Return the negative log likelihood of the geometry's errors, Laplace distributed; no gradient reaches those.
-
-    Raises:
-        ValueError: the output has no uncertainty.
-    """
+    """Return the negative log likelihood of the geometry's errors, Laplace distributed; no gradient reaches those."""
     if output.uncertainty is None:
         raise ValueError("these heads predict no uncertainty")
     off = (output.geometry(*wanted.cells.T).detach() - wanted.geometry).abs()
@@ -428,9 +414,6 @@ def score_loss(output: DetectorOutput, wanted: Targets) -> Tensor:
     """Return the cross entropy of the scores of all peaks, plus that of all kinds at their cells.
 
     The second counts as much and trains the same network.
-
-    Raises:
-        ValueError: the output has no score.
     """
     if output.score is None:
         raise ValueError("this output is not refined")

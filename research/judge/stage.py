@@ -77,11 +77,7 @@ class Verdict(NamedTuple):
 
 
 class Stage:
-    """The scene of one variant of a task, at the start of the execution.
-
-    Attributes:
-        recording: states since the start.
-    """
+    """The scene of one variant of a task at the start of the execution; ``recording`` holds the states since."""
 
     def __init__(self, task: Task) -> None:
         self.task = task

@@ -165,11 +165,7 @@ class Cell:
         return None
 
     def check(self) -> None:
-        """Refuse invalid words of its commands before any is run; datasets and policies need not exist.
-
-        Raises:
-            MemobenchError: an unknown setting or value, with the nearest known one.
-        """
+        """Refuse invalid words of its commands before any is run; datasets and policies need not exist."""
         from lerobot_memobench.rollouts.plan import take_run_options
         from lerobot_memobench.rollouts.settings import read_settings
 
@@ -241,5 +237,4 @@ def _in_any_folder(words: Iterable[str]) -> list[str]:
 
 
 def _last_of_each(words: Sequence[str]) -> list[str]:
-    """Return the last word of each key."""
     return list({word.partition("=")[0]: word for word in words}.values())

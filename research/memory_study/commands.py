@@ -31,7 +31,6 @@ class Cost:
     cpu_s: float
 
     def __add__(self, other: Cost) -> Cost:
-        """Return the sum of both."""
         return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
 
 
@@ -146,11 +145,7 @@ def train_once(words: Sequence[str], log: Path, policy: Path, *, at_once: int = 
 
 
 def check_training(words: Sequence[str]) -> None:
-    """Refuse invalid words of ``lerobot train …`` before it is run; its dataset need not exist yet.
-
-    Raises:
-        MemobenchError: an unknown setting or value, with the nearest known one.
-    """
+    """Refuse invalid words of ``lerobot train …`` before it is run; its dataset need not exist yet."""
     from lerobot_memobench.commands.command_line import read_words
     from lerobot_memobench.training.command import take_training_options
 

@@ -55,11 +55,7 @@ class SeedContrast:
 
 
 def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str = "reference") -> SeedContrast:
-    """Return a row's difference from a reference with the same training seeds; its p are not adjusted.
-
-    Raises:
-        MemobenchError: the episodes or their scenes differ.
-    """
+    """Return a row's difference from a reference with the same training seeds; its p are not adjusted."""
     episodes, rng = episodes_of(reference), np.random.default_rng(0)
     weights, tasks = _weights(reference[0], episodes)
     base = _successes(reference, episodes, reference_name)
@@ -122,7 +118,6 @@ def episodes_of(runs: Runs) -> list[Key]:
 
 
 def _check_scenes(runs: Runs, reference: Runs, name: str, reference_name: str) -> None:
-    """Refuse episodes whose suite or variant differs from the reference's, where both are known."""
     others = {_key(record): record for records in reference for record in records}
     for record in (record for records in runs for record in records):
         other = others.get(_key(record), {})
@@ -135,7 +130,6 @@ def _check_scenes(runs: Runs, reference: Runs, name: str, reference_name: str) -
 
 
 def _successes(runs: Runs, episodes: Sequence[Key], name: str) -> Array:
-    """Return success (training seeds, episodes), 0 or 1."""
     found = [{_key(record): float(bool(record["success"])) for record in records} for records in runs]
     if any(sorted(each) != list(episodes) for each in found):
         raise MemobenchError(f"{name!r} has other episodes; finish all rows with the same seeds")

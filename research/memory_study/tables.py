@@ -59,10 +59,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> "solved" (SR) and "follows" per training seed, and the best success "without" a memory.
-
-    Per cent.
-    """
+    """Return title of a row -> "solved" (SR) and "follows" per training seed, and "without" a memory, per cent."""
     found, ceiling = {}, _ceiling(grid.suites[suite].ceilings)
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
@@ -83,11 +80,7 @@ def titles(grid: Grid) -> list[str]:
 
 
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return title -> evaluated cells of the rows of a suite.
-
-    Raises:
-        MemobenchError: a training, or an evaluation, is of other words than the grid's.
-    """
+    """Return title -> evaluated cells of the rows of a suite."""
     found: dict[str, list[Cell]] = {}
     for title, (name, row) in zip(titles(grid), grid.rows.items(), strict=True):
         for cell in (Cell(grid, out, suite, name, seed) for seed in range(row.seeds)):
@@ -103,11 +96,7 @@ def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
 
 
 def evaluated(cell: Cell, part: str) -> bool:
-    """Return whether a cell's evaluation, or a control, is done.
-
-    Raises:
-        MemobenchError: it is of other words than the grid's, or a log is there without them.
-    """
+    """Return whether a cell's evaluation, or a control, is done."""
     command, folder = cell.log(part).with_suffix(".json"), cell.evaluation(part)
     if folder.is_dir() and not command.exists():
         raise MemobenchError(f"{folder} exists, but {command} with its command is missing; remove the folder")
@@ -125,11 +114,7 @@ def _check_policies(rows: Rows) -> None:
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
-    """Return the figures of an evaluation, counted from its log.
-
-    Raises:
-        MemobenchError: its card has another command than the cell, or asks for more rollouts than exist.
-    """
+    """Return the figures of an evaluation, counted from its log."""
     return _figures(cell.evaluation(part), tuple(cell.carded_words(part)))
 
 
@@ -157,7 +142,6 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
-    """Return figures that are not rounded, for means over training seeds."""
     rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in METRICS}
     return {"n": row["SR"].n, **rates}
 
@@ -216,7 +200,6 @@ def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
 
 
 def _by_memory_type(rows: Rows) -> str:
-    """Return a table like the paper's: four rates of each memory type."""
     header = ("", *(f"{kind} {metric}" for kind in MEMORY_TYPES for metric in METRICS))
     lines = []
     for row, cells in rows.items():
@@ -294,7 +277,6 @@ def _sealed(rows: Rows) -> str:
 
 
 def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
-    """Return success minus the ceiling, which is a number without an interval of its own."""
     ceiling = _ceiling(ceilings)
     if ceiling is None:
         return ""
