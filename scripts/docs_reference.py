@@ -623,10 +623,7 @@ LINK = re.compile(r"\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
 
 
 def relink(markdown: str, source: str, page: str) -> str:
-    """Return Markdown of the repository's file ``source`` with its links adapted to the site's page ``page``.
-
-    Links to files outside the site become the path as code.
-    """
+    """Return Markdown of the file ``source`` as the site's page ``page``; links that leave the site become paths."""
     folder = posixpath.dirname(page) or "."
 
     def adapt(match: re.Match[str]) -> str:

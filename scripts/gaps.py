@@ -31,10 +31,7 @@ HOME = Atom("handhome", ())
 
 
 def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
-    """Run the expert on one episode; return its success and the gap of each checkpoint, without held steps.
-
-    A gap is None if the checkpoint was not reached or nothing before it has to be remembered.
-    """
+    """Return success and the gap of each checkpoint without held steps; None if not reached, or without a cue."""
     episode = Episode(task, referent="random")
     episode.reset(seed)
     cues = _prompt_cues(episode)
@@ -82,7 +79,6 @@ def _prompt_cues(episode: Episode) -> list[int]:
 
 
 def _scene(episode: Episode) -> NDArray[np.float64]:
-    """Return the positions of all joints, m or rad, and objects, m."""
     sim = episode.sim
     joints = [sim.world.articulation(name)[1] for name in sorted(sim.world.joints)]
     return np.array([*joints, *(x for name in episode.task.objects for x in sim.body_pose(name)[0])])

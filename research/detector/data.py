@@ -83,11 +83,7 @@ class DetectorData:
     workers: int = 1
 
     def pictures(self, folder: Path, allowed: range, progress: Callable[[Advance], None] | None = None) -> Pictures:
-        """Make the images that a folder lacks, and return all of them.
-
-        Raises:
-            MemobenchError: a seed is not one of those allowed, or the folder was begun with other kinds.
-        """
+        """Make the images that a folder lacks, and return all of them."""
         seeds = range(self.first_seed, self.first_seed + self.episodes)
         if seeds[0] not in allowed or seeds[-1] not in allowed:
             raise MemobenchError(
@@ -111,11 +107,7 @@ class DetectorData:
 
 @dataclass(frozen=True)
 class EpisodeImages:
-    """The labelled images of one episode, a job.
-
-    Attributes:
-        name: of the task. seed: of the episode. folder: the file. frames: how many of the episode are taken.
-    """
+    """The labelled images of so many ``frames`` of one episode of the task ``name``, a job."""
 
     name: str
     seed: int

@@ -46,11 +46,7 @@ Localise = Callable[[Rows], tuple[NDArray[np.int64], NDArray[np.float64], NDArra
 
 
 def evaluate(file: Path, folder: Path, pictures: Callable[[], Pictures]) -> str:
-    """Evaluate the detector of a file, write table and numbers to a folder, and return the table.
-
-    Args:
-        pictures: makes the labelled images, both cameras' of each frame one after the other.
-    """
+    """Evaluate the detector of a file on images, both cameras' of each frame in turn, and return the written table."""
     detector = load_detector(file)
     if detector.kinds != kinds():
         raise MemobenchError(f"the detector of {file} knows other kinds of objects than this version; train a new one")
@@ -80,11 +76,7 @@ def localising(localizer: ObjectLocalizer) -> Localise:
 
 
 def outcomes(localise: Localise, pictures: Pictures) -> tuple[Outcomes, Outcomes]:
-    """Return the outcome of every visible object (n,), and the false detections (m,).
-
-    Args:
-        pictures: both cameras' of each frame, one after the other.
-    """
+    """Return the outcomes of visible objects (n,) and false detections (m,); images are both cameras' of each frame."""
     right: list[Outcomes] = [np.zeros(0, OBJECT)]
     wrong: list[Outcomes] = [np.zeros(0, OBJECT)]
     for start in range(0, len(pictures), len(MJCF_CAMERAS)):

@@ -82,12 +82,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Training:
-    """Settings of a training.
-
-    Attributes:
-        updates: number. batch: images of each. rate: highest learning rate; it rises for a twentieth of the updates
-            and falls as a cosine. decay: weight decay. seed: of weights, order and augmentation.
-    """
+    """Settings of a training; ``rate`` is the highest learning rate, after a twentieth of the updates."""
 
     updates: int = 18_000
     batch: int = 32
@@ -106,12 +101,7 @@ def train(
     save_every: int = 50,
     progress: Progress | None = None,
 ) -> Path:
-    """Train a detector, or resume the training that a folder holds; return the file of its weights.
-
-    Args:
-        pictures: labelled images. kinds: names of the objects in them. folder: for checkpoint, losses and weights.
-        encoder: makes the one to train. save_every: updates between two checkpoints.
-    """
+    """Train a detector of ``kinds``, or resume the training in ``folder``; return the file of its weights."""
     folder.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
     torch.manual_seed(settings.seed)
@@ -321,11 +311,7 @@ class Targets:
 
 
 def targets(rows: Rows, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE) -> Targets:
-    """Return the targets of labelled images (N,).
-
-    Args:
-        kinds, grid, fine, coarse: as of `detector.Heads`.
-    """
+    """Return the targets of labelled images (N,); other arguments as of `detector.Heads`."""
     images, places = np.nonzero(
         (np.arange(rows["things"].shape[1]) < rows["count"][:, None]) & (rows["things"]["pixels"] >= LEAST_PIXELS)
     )
@@ -455,8 +441,6 @@ def whiten(detector: Detector, batches: Iterable[Tensor]) -> None:
 
 
 class _Moments:
-    """Mean (d,) and covariance (d, d) of rows that come in parts."""
-
     def __init__(self, width: int) -> None:
         self.count, self.total = 0, torch.zeros(width, dtype=torch.float64)
         self.squares = torch.zeros(width, width, dtype=torch.float64)

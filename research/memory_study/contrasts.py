@@ -38,8 +38,7 @@ class SeedContrast:
     Attributes:
         low, high: 95 % interval over training seeds and episodes.
         p: of sign flips of the episodes' differences, each the mean over training seeds.
-        episodes: number of pairs.
-        detectable: smallest true difference that so many episodes show with 80 % power at 5 %; None above 1.
+        detectable: see `statistics.detectable`.
         of_seeds: the difference of each training seed.
         p_of_seeds: of a paired t test over them; None with fewer than three.
     """
@@ -150,7 +149,6 @@ def _weights(records: Sequence[Record], episodes: Sequence[Key]) -> tuple[Array,
 
 
 def _draws(table: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
-    """Return bootstrap draws of the weighted mean of a table (training seeds, episodes)."""
     seeds = rng.multinomial(len(table), np.full(len(table), 1 / len(table)), DRAWS) / len(table)
     times = np.empty((DRAWS, table.shape[1]))  # how often each episode is drawn
     for indices in tasks:

@@ -169,9 +169,6 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
     """Return the cells that words name: a suite, a row or a seed (``strict``, ``bank``, ``seed=0``); by none all.
 
     Several words of one kind are alternatives; words of different kinds must all hold.
-
-    Raises:
-        MemobenchError: an unknown word.
     """
     suites, rows, seeds = set[str](), set[str](), set[int]()
     for word in only:

@@ -35,9 +35,6 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
     """Return the Markdown of a suite's rows; "" where none is evaluated.
 
     A row is shown as soon as one of its training seeds has been evaluated, with their number.
-
-    Raises:
-        MemobenchError: a result is of another grid, or a cell of two policies.
     """
     rows = evaluated_rows(grid, out, suite)
     if not rows:
@@ -240,7 +237,6 @@ def _endings(rows: Rows) -> str:
 
 
 def _conditions(rows: Rows) -> str:
-    """Return SR in each other control, and its change from the same scenes without the control."""
     last = {row: cells[-1] for row, cells in rows.items()}
     parts = dict.fromkeys(part for cell in last.values() for part in cell.grid.rows[cell.row].controls)
     there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in last.items()}
@@ -291,7 +287,6 @@ def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
 
 
 def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
-    """Return a table of each row against a reference, by the training seeds that both have evaluated so."""
     base = {cell.seed: cell for cell in rows.get(reference, ()) if evaluated(cell, part)}
     found = {}
     for row, own in rows.items():
@@ -332,7 +327,6 @@ def table_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _costs(rows: Rows) -> str:
-    """Return wall time of a training, and of a control step of a rollout, on a shared machine."""
     lines = []
     for row, cells in rows.items():
         trained = [cost[TRAINING].wall_s / 60 for cell in cells if TRAINING in (cost := cell.costs())]
