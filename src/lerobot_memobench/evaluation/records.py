@@ -172,13 +172,14 @@ def _joined(parts: Sequence[Run]) -> Run:
                 raise MemobenchError(f"{a.folder} and {b.folder} differ in {name}; report each by itself")
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
     protocol = {key: group[0] if group.count(group[0]) == len(parts) else group for key, group in values.items()}
+    tasks = sorted(name for part in parts for name in part.protocol["tasks"])
     missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
     return replace(
         parts[0],
         name="+".join(dict.fromkeys(part.name for part in parts)),
         folder=parts[0].folder.parent,
         records=[record for part in parts for record in part.records],
-        protocol={**protocol, "tasks": sorted(name for part in parts for name in part.protocol["tasks"])},
+        protocol={**protocol, "tasks": tasks, POLICY: parts[0].protocol[POLICY]},
         notes=[f"{part.suites[0]}: {note}" for part in parts for note in part.notes],
         missing="; ".join(missing) or None,
         parts=parts,
