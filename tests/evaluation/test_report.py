@@ -31,7 +31,6 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    best_in_columns,
     csv_tables,
     csv_text,
     to_markdown,
@@ -219,7 +218,7 @@ def test_markdown_escapes_all_text() -> None:
 
 def test_terminal_tables(sweep: list[Run]) -> None:
     rows = (("x", Rate(0.5, 4), Rate(None, 0)), ("y", Rate(0.5, 8), Rate(0.1, 4)))
-    assert best_in_columns(rows) == {(0, 1), (1, 1), (1, 2)}
+    assert Table("t", "", ("a", "b", "c"), rows, mark_best=True).best == {(0, 1), (1, 1), (1, 2)}
     text = WRITERS["table"](evaluation_report(sweep))
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text

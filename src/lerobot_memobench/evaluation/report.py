@@ -41,7 +41,6 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    best_in_columns,
     percent_text,
     to_markdown,
     with_ids,
@@ -331,7 +330,7 @@ def evaluations_table(runs: Sequence[Run], notes: Sequence[str]) -> Table:
     rows = [run_row(run, columns) for run in runs]
     note = " ".join([NOTE, *notes])
     wide = wide_columns(LEADING, columns, runs[0].summary.average)
-    return Table("overview", "Evaluations", rows=rows, note=note, best=best_in_columns(rows), **wide)
+    return Table("overview", "Evaluations", rows=rows, note=note, mark_best=True, **wide)
 
 
 def run_row(run: Run, columns: Sequence[str] = PAPER_COLUMNS) -> tuple[Cell, ...]:
@@ -357,7 +356,7 @@ def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
 def wide_columns(leading: tuple[str, ...], columns: Sequence[str], metrics: Iterable[str]) -> dict[str, Any]:
     """Return arguments of a table whose rows are leading cells, then ``metrics`` under each of ``columns``."""
     metrics = tuple(metrics)
-    groups = (*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns))
+    groups = (*("" for _ in leading), *(name for name in columns for _ in metrics))
     return {"header": (*leading, *metrics * len(columns)), "groups": groups, "intervals": False}
 
 
@@ -390,7 +389,7 @@ def joined_table(runs: Sequence[Run]) -> Table:
         ("task", *(run.name for _ in metrics for run in runs)),
         rows,
         note="Per cent; – is not applicable. Intervals: in CSV, JSON and the report of each evaluation alone.",
-        groups=(("", 1), *((metric, len(runs)) for metric in metrics)),
+        groups=("", *(metric for metric in metrics for _ in runs)),
         strong=strong,
         rules=rules,
         intervals=False,
@@ -416,14 +415,14 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             ("replan interval", "n", *first.average),
             averages,
             note=f"{HOW_TO_READ[first.grouping]} {inputs}",
-            best=best_in_columns(averages),
+            mark_best=True,
         ),
         Table(
             f"replan-types-{slug}",
             f"{first.grouping.capitalize()}s by replan interval: {method}",
             rows=types,
             note=inputs,
-            best=best_in_columns(types),
+            mark_best=True,
             **wide_columns(("replan interval",), columns, first.average),
         ),
     )

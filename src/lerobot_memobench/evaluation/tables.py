@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -51,9 +52,9 @@ class Table:
 
     Attributes:
         key: short name, unique in a report.
-        groups: (title, columns) over the header, from the left; "" for none.
+        groups: title over each column, "" for none; neighbours with equal titles are one group.
         strong: rows that sum up, by index. rules: rows before which a line is drawn.
-        best: (row, column) of the cells to be marked as best.
+        mark_best: whether the best rates of each column are marked.
         intervals: whether rates are followed by their interval; CSV always has its bounds.
     """
 
@@ -62,10 +63,10 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     note: str = ""
-    groups: Sequence[tuple[str, int]] = ()
+    groups: Sequence[str] = ()
     strong: Collection[int] = ()
     rules: Collection[int] = ()
-    best: Collection[tuple[int, int]] = ()
+    mark_best: bool = False
     intervals: bool = True
 
     @property
@@ -74,9 +75,20 @@ class Table:
         return [f"{title} {name}".lstrip() for title, name in zip(self.titles, self.header, strict=True)]
 
     @property
-    def titles(self) -> list[str]:
+    def titles(self) -> Sequence[str]:
         """The title of the group over each column, "" for none."""
-        return [title for title, span in self.groups for _ in range(span)] or [""] * len(self.header)
+        return self.groups or [""] * len(self.header)
+
+    @cached_property
+    def best(self) -> set[tuple[int, int]]:
+        """The cells, (row, column), with the highest rate of their column, all of them where they tie as printed."""
+        best = set[tuple[int, int]]()
+        for column, cells in enumerate(zip(*self.rows, strict=True) if self.mark_best else ()):
+            printed = {row: percent(cell.value) for row, cell in enumerate(cells) if isinstance(cell, Rate)}
+            highest = max((value for value in printed.values() if value is not None), default=None)
+            if len(printed) > 1 and highest is not None:
+                best |= {(row, column) for row, value in printed.items() if value == highest}
+        return best
 
     def text(self, cell: Cell, interval: str = " [{}–{}]", escape: Callable[[str], str] = str) -> str:
         """Return a cell as text; ``interval`` is the format of an interval."""
@@ -135,20 +147,8 @@ def with_ids(table: Table) -> Table:
         table,
         header=("id", *table.header),
         rows=[(Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)],
-        groups=(("", 1), *table.groups) if table.groups else (),
-        best=[(row, column + 1) for row, column in table.best],
+        groups=("", *table.groups) if table.groups else (),
     )
-
-
-def best_in_columns(rows: Sequence[Sequence[Cell]]) -> set[tuple[int, int]]:
-    """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
-    best = set[tuple[int, int]]()
-    for column, cells in enumerate(zip(*rows, strict=True)):
-        printed = {row: percent(cell.value) for row, cell in enumerate(cells) if isinstance(cell, Rate)}
-        highest = max((value for value in printed.values() if value is not None), default=None)
-        if len(printed) > 1 and highest is not None:
-            best |= {(row, column) for row, value in printed.items() if value == highest}
-    return best
 
 
 # --- GitHub's Markdown ---
@@ -267,7 +267,8 @@ def latex_table(table: Table) -> list[str]:
 
 def _latex_groups(table: Table) -> list[str]:
     cells, rules, column = [], [], 1
-    for title, span in table.groups:
+    for title, columns in groupby(table.groups):
+        span = len([*columns])
         cells.append(rf"\multicolumn{{{span}}}{{c}}{{{latex_text(title)}}}" if title else " & " * (span - 1))
         if title:
             rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
@@ -406,8 +407,7 @@ def _in_parts(table: Table) -> list[Table]:
             title=table.title if k == 0 else f"{table.title}, continued",
             header=[table.header[column] for column in chosen],
             rows=[[row[column] for column in chosen] for row in table.rows],
-            groups=[(titles[column], 1) for column in chosen],
-            best=[(row, chosen.index(column)) for row, column in table.best if column in chosen],
+            groups=[titles[column] for column in chosen],
         )
         for k, part in enumerate(parts)
         for chosen in [[*leading, *part]]
