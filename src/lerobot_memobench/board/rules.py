@@ -41,11 +41,9 @@ REQUIRED = {
 
 
 def check_evaluation(run: Run, *, part: bool = False, control: str = "") -> None:
-    """Check an evaluation: settings, episodes, seeds, versions. The error names the first rule that it breaks.
+    """Check an evaluation, or a ``control`` of `CONTROL_SETTING`; the error names the first rule that it breaks.
 
-    Args:
-        part: whether any tasks of the suite, and any number of their episodes, are enough.
-        control: name of the control that it is, of `CONTROL_SETTING`.
+    Of a ``part``, any tasks of the suite, and any number of their episodes, are enough.
     """
     _check_settings(run, **CONTROL_SETTING.get(control, {}))
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
@@ -118,21 +116,21 @@ def _check_extent(run: Run, names: Sequence[str], fewest: int) -> None:
 
 def _check_versions(run: Run, names: Sequence[str]) -> None:
     for package in PACKAGES[:3]:  # this one, LeRobot and MuJoCo
-        versions = {start["versions"].get(package) for start in run.card["runs"]}
+        versions = {str(start["versions"].get(package)) for start in run.card["runs"]}
         if len(versions) > 1:
             raise MemobenchError(
-                f"{run.folder}: its parts ran under {package} {' and '.join(sorted(map(str, versions)))}; evaluate "
-                "again with one version"
+                f"{run.folder}: its parts ran under {package} {' and '.join(sorted(versions))}; evaluate again with "
+                "one version"
             )
-        for version in map(str, versions):
-            try:
-                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
-            except InvalidVersion:
-                fits = False
-            if not fits:
-                raise MemobenchError(
-                    f"{run.folder}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
-                )
+        (version,) = versions
+        try:
+            fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+        except InvalidVersion:
+            fits = False
+        if not fits:
+            raise MemobenchError(
+                f"{run.folder}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
+            )
     for name in names:
         here, stored = task_hash(get_task(name)), run.card["task_files"].get(name)
         if here != stored:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
-import io
 import re
 import shutil
 import unicodedata
@@ -43,17 +42,17 @@ ABOUT = "submission"
 
 # --- the block ---
 
+# Windows cannot have files with names of devices.
 ROW_NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{1,63}")
-"""Without the names of devices in Windows."""
 TEXT = re.compile(r"[\w(][\w .,:;+()/%~–-]{0,199}")
 FIRST_DAY = "2026-01-01"
+# Alphabets with letters of one shape: a word that mixes them imitates another name.
 LOOK_ALIKE = {"LATIN", "CYRILLIC", "GREEK"}
-"""Alphabets with letters of one shape; a word that mixes them imitates another name."""
 ACCOUNT = re.compile(r"@[A-Za-z0-9-]{1,39}")
+# Without look-alike hosts (IDNA) and paths that lead elsewhere.
 LINK = re.compile(
     r"https://(?!(.*\.)?xn--|.*/(\.|%2e){1,2}(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE
 )
-"""Without look-alike hosts (IDNA) and paths that lead elsewhere."""
 
 
 def row_name(name: str) -> str:
@@ -125,14 +124,9 @@ def own_evaluation(folder: Path) -> Run:
 
 
 def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]) -> Path:
-    """Write the folder of a submission, and return it. An earlier submission there is replaced.
+    """Write the folder of a submission, named after its row, and return it. An earlier submission is replaced.
 
-    Args:
-        folder: its last part is the name of the row.
-        evaluations: "" for the evaluation itself, or a name of `CONTROLS` -> folder of a finished evaluation.
-
-    Raises:
-        MemobenchError: an evaluation lacks its card or its log, or the folder holds something else.
+    ``evaluations`` maps "" for the evaluation itself, or a name of `CONTROLS`, to the folder of a finished one.
     """
     if folder.exists() and not (has_evaluation(folder) and ABOUT in read_evaluation(folder)):
         raise MemobenchError(f"{folder} exists and holds no submission; choose another --out or --name")
@@ -144,10 +138,8 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
         evaluation = own_evaluation(source)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
         write_evaluation(target, {**evaluation.card, **block})
-        packed = io.BytesIO()
-        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:  # equal logs, equal files
-            file.write(log_text(evaluation.records).encode())
-        write_file(target / LOG, packed.getvalue())
+        # Without its time, so that equal logs are equal files.
+        write_file(target / LOG, gzip.compress(log_text(evaluation.records).encode(), mtime=0))
     return folder
 
 
@@ -162,7 +154,7 @@ PROMISES = (
 
 
 def pull_request(name: str, about: About, evaluation: Run) -> str:
-    """Return the text in Markdown: files, statements of the submitter, promises to confirm, the evaluation's report."""
+    """Return the text in Markdown, with promises to confirm and the evaluation's report."""
     stated = about.model_dump(exclude_none=True)
     stated |= stated.pop("links")
     lines = [

@@ -174,22 +174,18 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
             file_name(episode_id(record), "a rollout's name")
             video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
             if video.is_file():
-                # A timeline under another rollout's video would mislead.
-                if _fits(frame_count(video), record):
-                    videos[k] = video
-                else:
+                # A timeline under another rollout's video would mislead. A video has a frame of the start, one per
+                # control step, and the last one held.
+                frames, steps = frame_count(video), record.get("steps")
+                whole = int(record.get("prompt_steps") or 0) + int(steps or 0) + LAST_FRAMES + 1
+                if frames is None or (steps is not None and frames != whole):
                     misfits.append(video.name)
+                else:
+                    videos[k] = video
     if not misfits:
         return videos, []
     listed = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
     return videos, [f"Videos that do not clearly belong to a logged rollout were left out: {listed}."]
-
-
-def _fits(frames: int | None, record: Record) -> bool:
-    if frames is None or record.get("steps") is None:
-        return frames is not None
-    # A frame of the start, one per control step, and the last one held.
-    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + LAST_FRAMES + 1
 
 
 def frame_count(path: Path) -> int | None:
