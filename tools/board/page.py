@@ -15,9 +15,10 @@ from pathlib import Path
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.evaluation_file import INPUTS
-from lerobot_memobench.evaluation.comparison import Contrast, compare_evaluations
+from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, stand_ins_of
+from lerobot_memobench.evaluation.statistics import Contrast
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
 from lerobot_memobench.untrusted import checked, parsed
 from tools.board.check import RERUNS, ranked, read_board

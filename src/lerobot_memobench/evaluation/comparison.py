@@ -7,46 +7,20 @@ Other controls are evidence, which needs one evaluation (`evidence`), and granul
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.settings import INTACT, SETTINGS
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
-from lerobot_memobench.evaluation.metrics import (
-    MEMORY_TYPE,
-    METRICS,
-    PROCESS_METRICS,
-    SUITE,
-    Record,
-    by_task,
-    inputs_phrase,
-    operations,
-    percent,
-    prefix,
-    rollout_value,
-    satisfied,
-    varies,
-)
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, SUITE, Record, inputs_phrase, operations, percent
 from lerobot_memobench.evaluation.records import SCENES, Run, headline, other_draws, other_hashes, other_physics
-from lerobot_memobench.evaluation.statistics import (
-    DRAWS,
-    PERMUTATIONS,
-    Array,
-    Estimate,
-    detectable,
-    holm,
-    interval_of,
-    mcnemar,
-    newcombe,
-    sign_flip,
-)
+from lerobot_memobench.evaluation.statistics import PERMUTATIONS, Contrast, Estimate, Kind, Pair, contrasts_of
 from lerobot_memobench.evaluation.tables import (
     NOT_APPLICABLE,
     Cell,
@@ -58,20 +32,13 @@ from lerobot_memobench.evaluation.tables import (
     percent_text,
     with_ids,
 )
-from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
 from lerobot_memobench.tasks.libero_suites import libero_id
-from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
 
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
 
-Pair = tuple[Record, Record]
-
 
 # --- controls ---
-
-LEAST_GAP = 0.01
-"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
 
 
 @dataclass(frozen=True)
@@ -198,16 +165,6 @@ def control_between(a: Run, b: Run) -> Control | None:
     return None
 
 
-def oracle_share(first: float | None, second: float | None) -> float | None:
-    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
-
-    None where a rate does not apply or the gap is under `LEAST_GAP`.
-    """
-    if first is None or second is None or 1.0 - first < LEAST_GAP:
-        return None
-    return (second - first) / (1.0 - first)
-
-
 # --- pairs of rollouts ---
 
 
@@ -289,45 +246,6 @@ def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> li
 
 # --- comparison ---
 
-Kind = Literal["average", "memory type", "suite", "task", "family"]
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One metric of B against A over the same episodes. Rates are fractions.
-
-    Attributes:
-        metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
-        n: number of pairs.
-        interval: 95 % interval of b − a.
-        p: exact McNemar for outcomes of yes or no, sign-flip permutation else.
-        exact: whether every assignment of signs was tried.
-        detectable: see `statistics.detectable`.
-        only_a, only_b: pairs in which only one of both succeeded (SR and prefix completion only).
-        adjusted: p of a task after Holm over the tasks.
-        closed: `oracle_share`, where the control reports it.
-    """
-
-    kind: Kind
-    scope: str
-    metric: str
-    n: int
-    a: float
-    b: float
-    interval: tuple[float, float]
-    p: float
-    exact: bool
-    detectable: float | None
-    only_a: int | None = None
-    only_b: int | None = None
-    adjusted: float | None = None
-    closed: Estimate | None = None
-
-    @property
-    def value(self) -> float:
-        """The second rate minus the first."""
-        return self.b - self.a
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -377,7 +295,8 @@ def compare_evaluations(
     if other_hashes(a.protocol, b.protocol):
         allowed.add(SCENES)
     pairs = _paired(a, b, allowed)
-    contrasts = _contrasts(pairs, control, np.random.default_rng(seed), permutations)
+    reported = {} if control is None else {"by_checkpoint": control.by_checkpoint, "closes": control.gap_closed}
+    contrasts = contrasts_of(pairs, np.random.default_rng(seed), permutations, **reported)
     first, second = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
     return Comparison((first, second), contrasts, _notes(a, b, pairs, control), control)
 
@@ -388,142 +307,6 @@ def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
         with suppress(MemobenchError):  # reversed, of two policies, or of other protocols: no control
             if control_between(a, b) is not None:
                 yield compare_evaluations(a, b)
-
-
-# --- tasks and scopes ---
-
-
-class _Sample(NamedTuple):
-    """A metric in the pairs of a task, (n, 2) in [0, 1], and its mean in each bootstrap draw, (`DRAWS`, 2)."""
-
-    values: Array
-    drawn: Array
-
-
-class _Task(NamedTuple):
-    name: str
-    memory_type: str
-    family: str | None
-    samples: Mapping[str, _Sample]
-
-
-def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
-    partners = {id(first): second for first, second in pairs}
-    rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
-    tasks = []
-    for name, group in by_task(first for first, _ in pairs).items():
-        both = [(record, partners[id(record)]) for record in group]
-        values = {
-            metric: np.array([[rollout_value(r, metric) for r in pair] for pair in both], float) for metric in METRICS
-        }
-        if by_checkpoint:
-            reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
-            values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        scenes = _scenes(group)  # rollouts of one scene depend on each other, so they are drawn together
-        drawn = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
-        samples = {
-            metric: _Sample(value, value[drawn].mean(axis=1))
-            for metric, value in values.items()
-            if not np.isnan(value).any()  # does not apply
-        }
-        family = get_task(name).family if suite_of(name) in SUITES else None
-        tasks.append(_Task(name, str(group[0]["memory_type"]), family, samples))
-    return tasks
-
-
-def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
-    """Return the rollouts of each scene of a task by their index, (S, V): V is 1 unless each scene has V variants."""
-    scenes: dict[Any, list[int]] = {}
-    for k, record in enumerate(group):
-        scenes.setdefault(record.get("seed") if varies(record) else (k,), []).append(k)
-    whole = len({len(scene) for scene in scenes.values()}) == 1
-    return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
-
-
-def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]:
-    """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups."""
-    types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
-    families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}
-    types = [group for group in types if group]
-    kind: Kind = SUITE if tasks[0].memory_type in LIBERO_SUITES else MEMORY_TYPE
-    alone = kind == SUITE and len(types) == 1
-    return [
-        ("average", tasks[0].memory_type if alone else f"average of {kind}s", types),
-        *((kind, group[0].memory_type, [group]) for group in types if not alone),
-        *(("task", task.name, [[task]]) for task in tasks),
-        *(("family", str(name), [group]) for name, group in families.items()),
-    ]
-
-
-# --- one metric in one scope ---
-
-
-def _contrasts(
-    pairs: Sequence[Pair], control: Control | None, rng: np.random.Generator, permutations: int
-) -> list[Contrast]:
-    closes = control is not None and control.gap_closed
-    contrasts = []
-    for kind, scope, groups in _scopes(_tasks(pairs, by_checkpoint=control is not None and control.by_checkpoint)):
-        for metric in groups[0][0].samples if kind == "task" else METRICS:
-            samples = [[task.samples[metric] for task in group if metric in task.samples] for group in groups]
-            if applicable := [group for group in samples if group]:
-                contrasts.append(_contrast((kind, scope), metric, applicable, rng, permutations, closes))
-    for metric in METRICS:
-        of_tasks = [k for k, contrast in enumerate(contrasts) if contrast.metric == metric and contrast.kind == "task"]
-        for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
-            contrasts[k] = replace(contrasts[k], adjusted=p)
-    return contrasts
-
-
-def _contrast(
-    scope: tuple[Kind, str],
-    metric: str,
-    groups: list[list[_Sample]],
-    rng: np.random.Generator,
-    permutations: int,
-    closes: bool,
-) -> Contrast:
-    values = [sample.values for group in groups for sample in group]
-    sizes = [len(groups) * len(group) * len(sample.values) for group in groups for sample in group]
-    before, after = np.concatenate(values).T
-    weights = np.concatenate([np.full(len(value), 1 / size) for value, size in zip(values, sizes, strict=True)])
-    drawn = np.mean([np.mean([sample.drawn for sample in group], axis=0) for group in groups], axis=0)
-    # Summed as the report sums, so that both print the same digits.
-    a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
-    bounds, d = newcombe(before, after, weights), after - before
-    only_a = only_b = None
-    if metric in PROCESS_METRICS:
-        p, exact = sign_flip(d, weights, rng, permutations)
-    else:
-        only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
-        p = mcnemar(only_a, only_b)
-    return Contrast(
-        *scope,
-        metric=metric,
-        n=len(d),
-        a=a,
-        b=b,
-        interval=interval_of(drawn[:, 1] - drawn[:, 0], bounds),
-        p=p,
-        exact=exact,
-        detectable=detectable(d, weights),
-        only_a=only_a,
-        only_b=only_b,
-        closed=_closed(a, b, drawn, bounds) if closes else None,
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
-    value = oracle_share(a, b)
-    shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
-    if value is None or len(shares) <= 0.9 * len(drawn):  # the gap vanishes in too many draws for an interval
-        return Estimate(value)
-    low, high = interval_of(np.array(shares), (bounds[0] / (1.0 - a), bounds[1] / (1.0 - a)))
-    return Estimate(value, low, min(high, 1.0))
 
 
 # --- the report ---

@@ -18,7 +18,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
-from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, interval_of
+from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, interval_of, nested_mean
 from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, percent_text, with_interval
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DIFFICULTIES
@@ -167,12 +167,9 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     """Return the mean over groups of the means over their tasks, with intervals over scenes."""
 
-    def mean(values: Sequence[Sequence[Any]]) -> Any:
-        return np.mean([np.mean(group, axis=0) for group in values], axis=0)
-
     tasks = [task for group in groups for task in group]
-    rates = mean([[task.values.mean(axis=0) for task in group] for group in groups])
-    drawn = mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
+    rates = nested_mean([[task.values.mean(axis=0) for task in group] for group in groups])
+    drawn = nested_mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
     weights = [1 / (len(groups) * len(group) * len(task.values)) for group in groups for task in group]
     scenes = max(1.0, 1 / sum(len(task.values) * weight**2 for task, weight in zip(tasks, weights, strict=True)))
     estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate((*RATES, RELIABLE))}
@@ -182,14 +179,14 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
         estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1
     chances = [[task.chance for task in group] for group in groups]
-    permuted = mean([[task.permuted for task in group] for group in groups])
+    permuted = nested_mean([[task.permuted for task in group] for group in groups])
     return Evidence(
         # Equal means of other orders of addition may differ in their last bits.
         p=(1 + int((permuted >= rates[0] - 1e-9).sum())) / (1 + len(permuted)),
         effective=scenes,
         scenes=sum(len(task.values) for task in tasks),
         variants=tasks[0].variants if alone else None,
-        chance=tasks[0].chance if alone else float(mean(chances)),
+        chance=tasks[0].chance if alone else float(nested_mean(chances)),
         rates=estimates,
     )
 

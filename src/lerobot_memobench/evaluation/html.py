@@ -29,16 +29,7 @@ from lerobot_memobench.envs.video import LAST_FRAMES, OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_phrase
-from lerobot_memobench.evaluation.metrics import (
-    SUITE,
-    Rate,
-    Record,
-    Row,
-    by_task,
-    failure_of,
-    operations,
-    percent,
-)
+from lerobot_memobench.evaluation.metrics import SUITE, Rate, Record, Row, by_task, failure_of, operations, percent
 from lerobot_memobench.evaluation.records import Run, headline, read_runs, unlike
 from lerobot_memobench.evaluation.report import evaluation_report, outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
