@@ -29,8 +29,7 @@ RIGHT, RELIABLE = "right", "reliable"
 """Share of the evidence's among the answers given; share of pairs of variants of a scene that were both followed."""
 SHOWN = {name: name for name in RATES[:3]} | {RIGHT: "right, of the decided", RELIABLE: "reliable pairs"}
 """Columns of the tables: rate -> title."""
-ENOUGH = 35
-"""Effective number of scenes from which on the interval of a perfect policy begins at 90 %."""
+ENOUGH = 35  # effective scenes from which on the interval of a perfect policy begins at 90 %
 SENTENCE = (
     "Each scene was run with each variant of its task, so only the past differs. Follows: the answer, by the first "
     "object lifted or joint moved, is the one that the evidence asks for; right, of the decided: among rollouts with "
@@ -144,6 +143,7 @@ def _permuted(scene: Sequence[Record], rng: np.random.Generator) -> Array:
         groups.setdefault(instruction.get(record.get("variant") or 0), []).append(record)
     for group in groups.values():
         shown = np.array([goal.get(k := record.get("variant") or 0, k) for record in group])
+        # -1, no answer, is no variant.
         chosen = np.array([-1 if (k := record["choice"]) is None else goal.get(k, k) for record in group])
         right += (rng.permuted(np.tile(chosen, (DRAWS, 1)), axis=1) == shown).sum(axis=1)
     return right / len(scene)

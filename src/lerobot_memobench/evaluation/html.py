@@ -48,8 +48,7 @@ SCRIPTS = (
     *("pair", "main"),
 )
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
-MARK = "memobench html"
-"""Value of the page's ``generator``, by which a folder is recognised as a report."""
+MARK = "memobench html"  # value of the page's ``generator``, by which a folder is recognised as a report
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
 <p>This report was not finished; run <code>memobench report --html</code> again.'''
 

@@ -11,7 +11,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -69,9 +69,8 @@ def line_style(number: int, published: bool) -> dict[str, Any]:
     return {"color": colour, "marker": _MARKERS[other], "ls": _DASHES[other], "mfc": face, "ms": 4}
 
 
-@contextmanager
-def paper_style() -> Iterator[None]:
-    """Set fonts and lines of everything drawn inside."""
+def paper_style() -> AbstractContextManager[None]:
+    """Return a context that sets fonts and lines of everything drawn inside."""
     import matplotlib as mpl
 
     settings = {
@@ -88,8 +87,7 @@ def paper_style() -> Iterator[None]:
         "hatch.linewidth": 0.4,
         "pdf.fonttype": 42,  # text stays text
     }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(settings)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -135,10 +133,8 @@ def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
 
 # --- outcomes of rollouts ---
 
-NARROWEST_LABEL = 5.0
-"""Per cent; narrower parts of a bar have no room for a figure."""
-HEADING = 52
-"""Characters of a line left of a bar."""
+NARROWEST_LABEL = 5.0  # per cent; narrower parts of a bar have no room for a number
+HEADING = 52  # characters of a line left of a bar
 
 
 class Bar(NamedTuple):
@@ -252,9 +248,10 @@ def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) 
 
 # --- success by gap ---
 
+# The first group needs no memory over time.
 EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
 GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
-"""Groups of gaps from cue to use (`tasks.gap`), control steps; the first group needs no memory over time."""
+"""Groups of gaps from cue to use (`tasks.gap`), control steps."""
 
 
 def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:

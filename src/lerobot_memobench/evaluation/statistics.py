@@ -66,10 +66,9 @@ def sign_flip(
 
     With at most ``EXACT_UP_TO`` pairs that differ, every assignment of signs is looked at; else ``permutations`` random
     ones and the one observed, p = (1 + as extreme) / (1 + drawn).
-
-    `scipy.stats.permutation_test` refuses a single pair, misses sums that are equal but for rounding, and takes seven
-    times as long.
     """
+    # `scipy.stats.permutation_test` refuses a single pair, misses sums that are equal but for rounding, and takes seven
+    # times as long.
     terms = np.asarray(differences, dtype=np.float64) * np.asarray(weights, dtype=np.float64)
     terms = terms[np.abs(terms) > _TOLERANCE]
     observed = abs(float(terms.sum())) - _TOLERANCE  # sums that are equal but for rounding are as extreme
@@ -172,8 +171,7 @@ def nested_mean(groups: Sequence[Sequence[Any]]) -> Any:
 
 Pair = tuple[Record, Record]
 Kind = Literal["average", "memory type", "suite", "task", "family"]
-LEAST_GAP = 0.01
-"""Smallest gap to 100 % for which a share is given: below it, one rollout would reverse the share."""
+LEAST_GAP = 0.01  # below it, one rollout would reverse the share of the gap that is closed
 
 
 @dataclass(frozen=True)
@@ -214,10 +212,7 @@ class Contrast:
 
 
 def oracle_share(first: float | None, second: float | None) -> float | None:
-    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory).
-
-    None where a rate does not apply or the gap is under `LEAST_GAP`.
-    """
+    """Return the share of the gap between ``first`` and 1 that ``second`` closes (paper, oracle memory)."""
     if first is None or second is None or 1.0 - first < LEAST_GAP:
         return None
     return (second - first) / (1.0 - first)

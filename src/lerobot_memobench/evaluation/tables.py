@@ -280,7 +280,6 @@ def _latex_groups(table: Table) -> list[str]:
 
 WIDTH = 140
 """Columns of a report that is written to a file."""
-
 MOST_COLUMNS = 15
 """Columns of a table with groups that fit into a terminal."""
 
@@ -305,9 +304,7 @@ def to_text(report: Report) -> str:
 
 
 INDENT = 2
-
-PLAIN = Console(width=10_000, markup=False, highlight=False)
-"""Measures the width of texts."""
+PLAIN = Console(width=10_000, markup=False, highlight=False)  # measures texts that no edge breaks
 
 
 class Unbroken:
