@@ -67,11 +67,7 @@ def kinds() -> tuple[str, ...]:
 
 
 def kinds_of(sim: Simulation, things: list[Thing]) -> list[int]:
-    """Return the index of the kind of each object of a scene.
-
-    Raises:
-        MemobenchError: a drawer of a fixture that was registered from outside is none of the three.
-    """
+    """Return the index of the kind of each object of a scene."""
     regions = {
         int(sim.model.joint(part.joint).qposadr[0]): region
         for asset in sim.assets.values()
@@ -113,7 +109,6 @@ class Labeller:
 
     @cached_property
     def _cells(self) -> NDArray[np.int64]:
-        """The centre pixel of each of the masks' cells, along one side."""
         side = self._sim.render_settings.height
         return ((np.arange(MASK) + 0.5) * side / MASK).astype(np.int64)
 
@@ -151,7 +146,6 @@ class Labeller:
         return labels[counts > 0]
 
     def _turn(self, body: int, camera: Array) -> Array:
-        """Return cosine and sine (2,) of twice the angle of a body's x axis in the image."""
         if body in self._round:
             return np.full(2, np.nan)
         x, y, _ = camera.T @ self._sim.data.xmat[body].reshape(3, 3)[:, 0]

@@ -22,7 +22,6 @@ from tests.support.labelled_images import BOWLS, DRAWERS, small_encoder, synthet
 
 @pytest.fixture
 def frames(tmp_path: Path) -> Callable[..., Pictures]:
-    """Return a function that saves four frames with three objects, the second one visible to the wrist alone."""
 
     def save(**changed: Any) -> Pictures:
         rows = np.repeat(synthetic(4), 2)
@@ -38,7 +37,6 @@ def frames(tmp_path: Path) -> Callable[..., Pictures]:
 
 
 def detector(*, off: float = 0.0, kind: int = 0, without: int = 0) -> Localise:
-    """Return a detector whose positions are off by so many metres, or whose kinds are others."""
 
     def localise(rows: Rows) -> Any:
         things = rows[0]["things"][without : rows[0]["count"]]

@@ -55,7 +55,6 @@ class Stopped(Exception):
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Pictures:
-    """Twelve pictures on disk."""
     np.save(tmp_path / "pictures.npy", synthetic(12))
     return Pictures([tmp_path / "pictures.npy"])
 

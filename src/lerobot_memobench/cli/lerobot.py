@@ -221,7 +221,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
-    from lerobot_memobench.evaluation.headline import headline
+    from lerobot_memobench.evaluation.records import headline
     from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, failure_line, rates_table
     from lerobot_memobench.evaluation.tables import terminal_table
 
