@@ -24,7 +24,6 @@ from lerobot_memobench.evaluation.report import evaluation_report, failures_tabl
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge
 from lerobot_memobench.tasks.assessment import FAILURES
-from lerobot_memobench.tasks.failures import FAILURES
 from lerobot_memobench.tasks.libero_suites import libero_tasks
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, facts, rollout, write_log

@@ -32,9 +32,7 @@ from lerobot_memobench.evaluation.tables import (
     percent_text,
     with_ids,
 )
-from lerobot_memobench.tasks.catalogue import GROUPS, get_task, libero_id, suite_of
-from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.catalogue import libero_id
 
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
