@@ -46,7 +46,6 @@ def drawer() -> Demonstration:
 
 
 def grey(demo: Demonstration) -> Demonstration:
-    """Return a demonstration with grey images."""
     image = np.full((len(demo), 16, 16, 3), 128, np.uint8)
     return replace(demo, images={"image": image, "wrist_image": image})
 

@@ -24,7 +24,7 @@ from lerobot_memobench.evaluation.report import evaluation_report, failures_tabl
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge
 from lerobot_memobench.tasks.assessment import FAILURES
-from lerobot_memobench.tasks.libero_suites import libero_tasks
+from lerobot_memobench.tasks.catalogue import task_names
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, facts, rollout, write_log
 
@@ -165,7 +165,7 @@ def test_suites_are_not_mixed(tmp_path: Path) -> None:
 def test_suites_of_libero_are_joined_whatever_their_seeds(tmp_path: Path) -> None:
     for seed, suite in enumerate(("libero_spatial", "libero_goal")):
         own = {"memory_type": suite, "suite": suite, "seed_base": 7}
-        write_log(tmp_path / suite, [record(libero_tasks(suite)[0], marks=[], **own)], type="act", seed=seed)
+        write_log(tmp_path / suite, [record(task_names(suite=suite)[0], marks=[], **own)], type="act", seed=seed)
     (run,) = read_runs([tmp_path])
     assert (run.method, [*run.summary.memory_types]) == ("act", ["libero_spatial", "libero_goal"])
 

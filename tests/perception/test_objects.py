@@ -50,7 +50,6 @@ def localizer() -> ObjectLocalizer:
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
-    """Return the detections of a detector without errors."""
     things = row["things"][: row["count"]]
     detected = np.zeros(len(things), DETECTION)
     place, depth = projected(things["position"].astype(float), row)
@@ -61,7 +60,6 @@ def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
 
 
 def bent(sim: Simulation) -> Simulation:
-    """Bend the arm to another place."""
     here, turned = sim.eef_pose()
     assert reach(sim, here + np.array([0.1, -0.08, -0.1]), turned)
     settle(sim)

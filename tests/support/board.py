@@ -97,8 +97,6 @@ def first_failure(records: list[Json]) -> Json:
 
 
 def in_log(change: Callable[[list[Json]], object]) -> Callable[[Path], None]:
-    """A change of the log."""
-
     def apply(folder: Path) -> None:
         lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
         change(lines)
@@ -117,7 +115,6 @@ def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
 
 
 def stating(key: str, value: Any) -> Callable[[Path], None]:
-    """A statement of the submitter."""
     return in_card(lambda content: content["submission"].__setitem__(key, value))
 
 
