@@ -21,7 +21,7 @@ from lerobot_memobench.datasets import restore as restore_module
 from lerobot_memobench.datasets.convert import convert, find_files
 from lerobot_memobench.datasets.demonstration import Demonstration, digest
 from lerobot_memobench.datasets.episodes import read_episode, read_info, read_manifest
-from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable
+from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile
 from lerobot_memobench.datasets.layout import is_dataset
 from lerobot_memobench.datasets.restore import ORIENTATIONS, restore, task_of
 from lerobot_memobench.datasets.validate import images_of, replay
@@ -153,7 +153,7 @@ def test_differences_of_a_group_are_named(path, tmp_path, change, reason):
         file["actions"] = np.zeros((7, 7))
     with h5py.File(path, "a") as file:
         change(file["data/demo_1"])
-    with pytest.raises(Unusable, match=reason), PublishedFile(path) as file:
+    with pytest.raises(MemobenchError, match=reason), PublishedFile(path) as file:
         file.read("demo_1")
 
 
@@ -180,11 +180,11 @@ def test_files_that_cannot_be_opened(path, tmp_path):
         "hdf5/synthetic_task_demo.hdf5": "'bddl_file_content' is missing",
         "absent.hdf5": "no such file",
     }.items():
-        with pytest.raises(Unusable, match=reason), PublishedFile(tmp_path / name) as opened:
+        with pytest.raises(MemobenchError, match=reason), PublishedFile(tmp_path / name) as opened:
             opened.read("demo_0")
     with path.open("rb") as writer:
         fcntl.flock(writer, fcntl.LOCK_EX)  # as HDF5 locks files that it writes
-        with pytest.raises(Unusable, match="is locked"):
+        with pytest.raises(MemobenchError, match="is locked"):
             PublishedFile(path)
 
 

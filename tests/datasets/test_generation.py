@@ -13,11 +13,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from lerobot_memobench.datasets import record as recording
-from lerobot_memobench.datasets.episodes import read_info
+from lerobot_memobench.datasets import generate as recording
+from lerobot_memobench.datasets.episodes import list_episodes, read_info
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.datasets.layout import is_dataset
-from lerobot_memobench.datasets.validate import episode_count
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from tests.support.kills import hashes as tree_hash
@@ -121,7 +120,7 @@ def test_unfinished_run_is_continued_or_finished_early(tasks, recorded, tmp_path
     assert recorded == []
     assert [(each.task_name, each.failure) for each in summary.episodes] == [("task_a", None)] * 2
     assert summary.tasks == ("task_a", "task_b")
-    assert episode_count(early) == 2
+    assert len(list_episodes(early)) == 2
     assert "2 of 4 seeds were run" in (early / "README.md").read_text()
     assert not (early / ".staging").exists()
     with pytest.raises(MemobenchError, match="finished_early=True"):

@@ -8,8 +8,16 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts.demonstration_prompt import highlight_of
-from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
+from lerobot_memobench.experts.expert import highlight_of
+from lerobot_memobench.perception.detector import (
+    DETECTION,
+    MIN_SCORE,
+    PACKAGE,
+    Detector,
+    load_detector,
+    load_visual_encoder,
+    warn_of_former_scenes,
+)
 from lerobot_memobench.perception.objects import (
     APART,
     FACING,
@@ -18,17 +26,15 @@ from lerobot_memobench.perception.objects import (
     PARTS,
     SAME,
     ObjectLocalizer,
-    projected,
     views_of,
 )
-from lerobot_memobench.perception.weights import PACKAGE, load_detector, load_visual_encoder, warn_of_former_scenes
 from lerobot_memobench.policies.memobench_mem.objects import in_order
 from lerobot_memobench.sim.asset import TABLE_TOP, split_class
 from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from research.detector.labels import Labeller, Rows, kinds
+from research.detector.labels import Labeller, Rows, kinds, projected
 from research.detector.randomisation import reach, settle
 from tests.support.labelled_images import BOWLS, DRAWERS, simulation, small_encoder
 

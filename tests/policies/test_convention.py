@@ -20,8 +20,7 @@ from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import chosen_convention
-from lerobot_memobench.rollouts.plan import plan_line, with_names
-from lerobot_memobench.rollouts.settings import read_settings
+from lerobot_memobench.rollouts.plan import plan_line, read_settings, with_names
 from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
 

@@ -41,7 +41,7 @@ def written(
     mechanism: FastWeights, weights: list[tuple[Tensor, Tensor]], frame: Tensor, step: int
 ) -> tuple[list[tuple[Tensor, Tensor]], Tensor, list[float]]:
     """Return weights and biases of the heads after a frame (P, D), its outputs, and how long the steps were."""
-    encoded = mechanism.encoder(frame[None, None], torch.tensor([[step]]))[0, 0]
+    encoded = mechanism.encoder(frame[None], torch.tensor([step]))[0]
     rates = softplus(encoded @ mechanism.rate.weight.T + mechanism.rate.bias).clamp(max=MAX_RATE)
     after, outputs, lengths = [], [], []
     for head, (weight, bias) in enumerate(weights):
@@ -138,7 +138,7 @@ def turned(x: Tensor, place: int) -> Tensor:
 
 def slots_after(mechanism: recurrent.Recurrent, slots: list[Tensor], frame: Tensor, step: int) -> list[Tensor]:
     """Return the slots after a frame (P, D), by the formula, a slot and a head at a time."""
-    encoded = mechanism.encoder(frame[None, None], torch.tensor([[step]]))[0, 0]
+    encoded = mechanism.encoder(frame[None], torch.tensor([step]))[0]
     both = [normed(token, mechanism.pre_norm) for token in [*encoded, *slots]]
     of_key, of_value = mechanism.key_value.weight.chunk(2)
     keys = [turned(of_key @ token, place) for place, token in enumerate(both)]

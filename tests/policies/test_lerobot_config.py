@@ -13,7 +13,7 @@ from lerobot_memobench.envs.evaluation_file import Acting
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines import MemobenchRandomConfig
-from lerobot_memobench.policies.lerobot_config import acting, check_sizes
+from lerobot_memobench.policies.checkpoint import acting, check_sizes
 from lerobot_memobench.sim.object_layout import SIZE
 from tests.support.lerobot_policies import make_config, save_checkpoint
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.commands.lerobot_commands import call_lerobot
+from lerobot_memobench.commands.command_line import call_lerobot
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.constants import EXECUTION
 from lerobot_memobench.envs.env import MemobenchEnv

@@ -26,9 +26,8 @@ from lerobot_memobench.datasets.video import frame_reader
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.detector import Detector
+from lerobot_memobench.perception.detector import Detector, save_detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
-from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, PLACES

@@ -22,8 +22,8 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import WordTokenizerProcessorStep
 from lerobot_memobench.policies.memobench_mem.rollout import EnvMemory, Rollout
-from lerobot_memobench.training.average import begin_average
 from lerobot_memobench.training.data import Training
+from lerobot_memobench.training.loop import begin_average
 from tests.support.held_dataset import LENGTHS as HELD_LENGTHS
 from tests.support.held_dataset import make_held_dataset
 from tests.support.small_policy import (

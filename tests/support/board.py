@@ -16,9 +16,9 @@ from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.policies.checkpoint import tree_hash
+from lerobot_memobench.tasks.assessment import chance, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import chance, scene_and_variant
 from lerobot_memobench.tasks.task import STRICT
 from tests.support.logs import card
 

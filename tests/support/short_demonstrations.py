@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.record import RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.generate import RecordingSettings, compiled_episode, record
 from lerobot_memobench.datasets.validate import resimulate
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task

@@ -168,7 +168,7 @@ def record_of(name: str, seed: int, prompt: int, goals: int | None = None) -> st
         digest="",
         world="libero",
         stand_ins=[],
-    ).in_frames()
+    ).model_dump_json(exclude_none=True)
 
 
 def make_object_dataset(root: Path, images: bool = False, records: bool = False, goals: int | None = None) -> Path:

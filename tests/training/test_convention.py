@@ -28,8 +28,7 @@ from lerobot_memobench.policies.memobench_mem.objects import VIEWS
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.data import check_environment
 from lerobot_memobench.training.features import detected_slots
-from lerobot_memobench.training.trainer import prepare
-from lerobot_memobench.training.view import ViewOptions, write_view
+from lerobot_memobench.training.trainer import ViewOptions, prepare, write_view
 from tests.support.fake_loop import make_checkpoint
 from tests.support.synthetic_dataset import write_robot
 

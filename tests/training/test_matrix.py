@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from lerobot_memobench.constants import OBS_PHASE, OBS_STEP
 from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.average import TRAINING_FILE
+from lerobot_memobench.training.loop import TRAINING_FILE
 from tests.training.conftest import hashes, read_losses
 
 SEEN = {

@@ -16,8 +16,7 @@ from lerobot.utils.random_utils import load_rng_state
 from safetensors import safe_open
 from torch import nn, optim
 
-from lerobot_memobench.training.average import TRAINING_FILE, WeightAverage
-from lerobot_memobench.training.loop import TrainingLog, load_state, save_state
+from lerobot_memobench.training.loop import TRAINING_FILE, TrainingLog, WeightAverage, load_state, save_state
 from tests.training.conftest import read_losses
 
 

@@ -15,7 +15,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.training.view import ViewOptions, write_view
+from lerobot_memobench.training.trainer import ViewOptions, write_view
 from tests.support.held_dataset import LENGTHS, STRETCHES, make_held_dataset
 
 STATE, SLOTS, IMAGE = "observation.state", "observation.environment_state", "observation.images.image"
