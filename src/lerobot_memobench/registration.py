@@ -1,4 +1,4 @@
-"""Register the environment ``memobench`` and the policies ``memobench_*`` with LeRobot.
+"""Register the environment ``memobench`` and the policies ``memobench_*`` with LeRobot, and check its own commands.
 
 Importing the module of a configuration registers it, without loading the simulator or a model.
 """

@@ -278,7 +278,7 @@ def options(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     words = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
-    use_threads(LEARNING if words and words[0] in LEARN else ACTING)
+    use_threads(LEARNING if words and words[0] in LEARN else ACTING)  # before torch is imported
     verb = "resume" if words and words[0] in RESUMED else "start again"
     return run_app(app, words, "memobench", f"{verb} with: {shlex.join(['memobench', *words])}")
 

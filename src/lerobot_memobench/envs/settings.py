@@ -206,6 +206,7 @@ class EnvSettings:
     )
 
     def __post_init__(self) -> None:
+        # By `vars`, because the class is frozen.
         vars(self).update({name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for setting in fields(self):
             self._check(setting.name, str(setting.type), setting.metadata)
