@@ -20,7 +20,7 @@ from packaging.utils import canonicalize_name
 from lerobot_memobench.constants import PUBLISHED_MUJOCO
 from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
-from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
+from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, find_assets
 from lerobot_memobench.tasks.catalogue import get_task
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
@@ -143,11 +143,11 @@ def caches() -> Finding:
 
 def assets() -> Finding:
     """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
-    candidates = places()
-    if (place := usable(candidates)) is None:
-        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(candidates)}", OBTAIN)
-    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused(candidates)}"
-    if candidates[0].fault and candidates[0].source == ASSETS_VARIABLE:
+    place, unused = find_assets()
+    if place is None:
+        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused}", OBTAIN)
+    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused}"
+    if ASSETS_VARIABLE in unused:
         return Finding("assets", "warning", detail, f"correct or unset {ASSETS_VARIABLE}")
     return Finding("assets", "ok", detail)
 

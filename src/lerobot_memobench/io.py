@@ -42,10 +42,10 @@ def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield draft
         if durable:
-            _to_disk(draft)
+            flush_to_disk(draft)
         os.replace(draft, path)
         if durable:
-            _to_disk(path.parent)
+            flush_to_disk(path.parent)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -236,11 +236,13 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
-def _to_disk(path: Path) -> None:
+def flush_to_disk(*paths: Path) -> None:
+    """Wait until the disk holds files, or the entries of folders."""
     if sys.platform == "win32":
         return  # it cannot open folders, or flush files that are open for reading
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

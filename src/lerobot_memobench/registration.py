@@ -30,8 +30,8 @@ def prepare_lerobots_command(environment: MemobenchEnvConfig) -> tuple[PreTraine
     of an evaluation; a training may begin with any.
     """
     from lerobot_memobench.commands.command_line import PATH, parse_words, read_words
+    from lerobot_memobench.policies.checkpoint import acting
     from lerobot_memobench.policies.compatibility import check_actions, chosen_convention
-    from lerobot_memobench.policies.lerobot_config import acting
 
     name = Path(sys.argv[0]).name.replace("_", "-")  # `lerobot-eval`, or `lerobot_eval.py` of `python -m`
     command = next((choice for choice in ("train", "eval") if name.startswith(f"lerobot-{choice}")), None)

@@ -25,7 +25,7 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, rollout_value
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
-from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.catalogue import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 try:

@@ -20,8 +20,7 @@ from rich.table import Table
 
 from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
-from lerobot_memobench.jobs.start import prepare_process, reader_has_left
+from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal, prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LiberoSuite, Suite
 
 USAGE_ERROR = 2

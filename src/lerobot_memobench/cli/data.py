@@ -168,7 +168,7 @@ def cache(
     ] = None,
 ) -> None:
     """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
-    from lerobot_memobench.policies.lerobot_config import check_device, quiet
+    from lerobot_memobench.policies.checkpoint import check_device, quiet
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
     from lerobot_memobench.training.features import cache_dataset
 
@@ -210,7 +210,7 @@ def view(
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.episodes import read_info
-    from lerobot_memobench.training.view import view_options, write_view
+    from lerobot_memobench.training.trainer import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)

@@ -124,9 +124,9 @@ def evaluate(words: Mapping[str, str]) -> int:
     suites = check_tasks(words)
     if len(suites) > 1:
         return evaluate_suites(suites, words)
-    from lerobot_memobench.rollouts.plan import plan_words
+    from lerobot_memobench.rollouts.plan import plan_line
 
-    plan = plan_words(words)
+    plan = plan_line(as_command_line(words))
     hint = f"resume with: {plan.resuming_command}"
     with (
         adding_resume_hint("lerobot", lambda: hint),
@@ -221,7 +221,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
-    from lerobot_memobench.evaluation.headline import headline
+    from lerobot_memobench.evaluation.records import headline
     from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, failure_line, rates_table
     from lerobot_memobench.evaluation.tables import terminal_table
 

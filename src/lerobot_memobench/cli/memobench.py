@@ -32,13 +32,13 @@ from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     get_task,
     load_task,
+    longest_cue_to_use,
     suite_of,
     task_folder,
     task_names,
     task_number,
     task_record,
 )
-from lerobot_memobench.tasks.gap import longest_gap
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED, Task
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def task_table(tasks: Sequence[Task]) -> Table:
         if k and task.memory_type != tasks[k - 1].memory_type:
             rows.add_section()
         prompt = task.prompt.kind if task.prompt else ""
-        gap = str(longest_gap(task) or "")
+        gap = str(longest_cue_to_use(task) or "")
         number = str(task_number(task.name)) if known[k] else ""
         rows.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
     return rows

@@ -27,13 +27,14 @@ from lerobot_memobench.errors import MemobenchError, chain, nearest
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
     check_checkpoint,
+    check_sizes,
     checkpoint_folder,
     checkpoint_settings,
     checkpoint_type,
     looks_local,
+    quiet,
     shipped_policies,
 )
-from lerobot_memobench.policies.lerobot_config import check_sizes, quiet
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

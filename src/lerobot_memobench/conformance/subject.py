@@ -39,9 +39,8 @@ from lerobot_memobench.datasets.layout import objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import check_weights
+from lerobot_memobench.policies.checkpoint import check_device, check_weights, quiet
 from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
@@ -186,7 +185,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_memobench.training.data import open_datasets, open_training
-    from lerobot_memobench.training.view import needs_view, view_options, write_view
+    from lerobot_memobench.training.trainer import needs_view, view_options, write_view
 
     raw = LeRobotDataset(repository, root=root)
     if not set(CLOCK) <= set(raw.meta.features):

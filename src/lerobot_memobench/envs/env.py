@@ -33,8 +33,8 @@ from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS,
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
+from lerobot_memobench.tasks.assessment import scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of, task_names
-from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import Task
 

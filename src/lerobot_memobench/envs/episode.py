@@ -33,8 +33,7 @@ from lerobot_memobench.constants import (
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert, blind_routine
+from lerobot_memobench.experts.expert import Expert, PromptDemonstrator, blind_routine
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import (
     InvalidActionError,
@@ -43,11 +42,9 @@ from lerobot_memobench.sim.simulation import (
     UnstablePhysicsError,
     as_action,
 )
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evidence import Choice
-from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
+from lerobot_memobench.tasks.assessment import INVALID_ACTION, UNSTABLE_PHYSICS, Choice
+from lerobot_memobench.tasks.catalogue import get_task, initial_states
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import AS_BEGUN, Progress
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
@@ -55,7 +52,7 @@ from mujoco_raster.drawlist import Image
 
 
 class Fault(NamedTuple):
-    """Reason of an aborted execution: one of `tasks.failures.FAULTS`, and a sentence."""
+    """Reason of an aborted execution: one of `tasks.assessment.FAULTS`, and a sentence."""
 
     failure: str
     why: str

@@ -20,9 +20,8 @@ from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLI
 from lerobot_memobench.envs.settings import INTACT, steps_per_action
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.tasks.assessment import chance, classify_failure
 from lerobot_memobench.tasks.catalogue import group_of, suite_of
-from lerobot_memobench.tasks.evidence import chance
-from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import REFERENTS, STRICT, Task
 from lerobot_memobench.untrusted import Count, Malformed, Name, Number, Whole, checked, file_bytes, packed, parsed
 

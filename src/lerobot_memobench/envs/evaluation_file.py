@@ -117,7 +117,7 @@ class Start(TypedDict):
 
 
 class CardSettings(TypedDict, total=False):
-    """Settings of an evaluation that its protocol does not hold, see `rollouts.settings.EvaluationSettings`."""
+    """Settings of an evaluation that its protocol does not hold, see `rollouts.plan.EvaluationSettings`."""
 
     __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]
 

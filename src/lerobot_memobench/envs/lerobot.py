@@ -38,6 +38,7 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, INTACT, RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import (
+    check_states,
     find_tasks,
     group_of,
     lerobots_choice,
@@ -46,7 +47,6 @@ from lerobot_memobench.tasks.catalogue import (
     task_folder,
     task_index,
 )
-from lerobot_memobench.tasks.libero_suites import check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]

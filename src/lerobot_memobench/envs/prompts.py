@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
+from lerobot_memobench.experts.expert import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of, files_below
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
 from lerobot_memobench.tasks.task import Task

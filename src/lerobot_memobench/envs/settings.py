@@ -26,7 +26,7 @@ from lerobot_memobench.constants import (
 )
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, image_names
-from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
+from lerobot_memobench.tasks.catalogue import STEP_LIMITS
 from lerobot_memobench.tasks.task import (
     DIFFICULTIES,
     DRAWN,
