@@ -134,20 +134,13 @@ def is_of_benchmark(words: Mapping[str, str]) -> bool:
 
 @dataclass(frozen=True)
 class CommandSettings:
-    """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
+    """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them."""
 
-    Attributes:
-        config: the command's configuration class.
-        words: LeRobot's full name of each setting on the command line -> its text or value.
-        file: settings of the configuration file. config_path: the file's path, or its repository.
-        begun: configuration of the training whose checkpoint is the file; None for other files.
-    """
-
-    config: type
-    words: Mapping[str, Any]
-    file: Settings = field(default_factory=dict)
-    config_path: str | None = None
-    begun: Any = None
+    config: type  # the command's configuration class
+    words: Mapping[str, Any]  # LeRobot's full name of each setting on the command line -> its text or value
+    file: Settings = field(default_factory=dict)  # settings of the configuration file
+    config_path: str | None = None  # path or repository of that file
+    begun: Any = None  # configuration of the training whose checkpoint the file is
 
     @cached_property
     def settings(self) -> Settings:

@@ -57,22 +57,16 @@ Actions = NDArray[np.float32]
 
 @dataclass
 class Subject:
-    """A policy with its processors, a dataset, and the observations of its episodes in a rollout.
-
-    Attributes:
-        dataset: samples as in training, with the policy's delta timestamps.
-        streams: `STREAMS` episodes. cameras: of the dataset.
-        numbers: (N,) index in ``dataset`` of each frame of the named dataset.
-    """
+    """A policy with its processors, a dataset, and the observations of its episodes in a rollout."""
 
     name: str
     policy: Any
     preprocessor: Any
     postprocessor: Any
-    dataset: Any
-    streams: list[Stream]
-    cameras: list[str]
-    numbers: NDArray[np.int64]
+    dataset: Any  # samples as in training, with the policy's delta timestamps
+    streams: list[Stream]  # `STREAMS` episodes
+    cameras: list[str]  # of the dataset
+    numbers: NDArray[np.int64]  # (N,) index in ``dataset`` of each frame of the named dataset
 
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.
