@@ -45,8 +45,7 @@ def check_choice(name: str, value: object, known: Sequence[str]) -> None:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
-HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}
-"""Word of a paper -> the hint in place of near words."""
+HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}  # word of a paper -> the hint in place of near words
 
 
 def nearest(unknown: str, known: Iterable[str]) -> str:
@@ -66,8 +65,7 @@ def nearest(unknown: str, known: Iterable[str]) -> str:
     return f"none of the {len(words)} known ones is near"
 
 
-LONGEST = 80
-"""Length of quoted values in messages, characters."""
+LONGEST = 80  # length of quoted values in messages, characters
 
 
 def short(value: Any) -> str:

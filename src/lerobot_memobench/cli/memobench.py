@@ -251,8 +251,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
 
 RESUMED = ("generate", "cache", "convert", "push", "assets")
 """Commands that continue when given again; any other starts over."""
-LEARN = ("cache",)
-"""Commands that train or encode in their own process; the others simulate, or compute little."""
+LEARN = ("cache",)  # commands that train or encode in their own process; the others simulate, or compute little
 
 for group, commands in COMMANDS.items():
     for command in commands:

@@ -42,8 +42,7 @@ if TYPE_CHECKING:
 Settings = dict[str, Any]
 """Nested settings: name -> text of a command line, value of a file, or the settings of a section."""
 
-RECIPE, CONFIG_FILE = "config", "config_path"
-"""Our key and LeRobot's for a configuration file."""
+RECIPE, CONFIG_FILE = "config", "config_path"  # our key and LeRobot's for a configuration file
 DATASET = "dataset"
 PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
 """Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
@@ -423,8 +422,7 @@ def _begun_training(config: Any, config_path: str | None) -> Any:
 # --- values of the fields of a configuration class ---
 
 PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
-NULLS = ("null", "~")
-"""Texts that stand for no value, as in YAML; for a number or a truth value also ``none``."""
+NULLS = ("null", "~")  # texts that stand for no value, as in YAML; for a number or a truth value also `none`
 
 
 def build_config(annotation: Any, settings: Any, key: str = "") -> Any:

@@ -26,8 +26,7 @@ TASK = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_i
 PROMPTS = (8, 11, 14)
 """Frames of each episode's prompt. They differ, so that the rows of a batch begin to act at different calls."""
 EXECUTION_FRAMES = 27
-THINGS = 4
-"""Objects of a synthetic scene."""
+THINGS = 4  # objects of a synthetic scene
 
 
 def write_streams(

@@ -45,14 +45,11 @@ from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
-REPLAN = 3
-"""Default actions per chunk, so that a short stream has several chunks."""
-STREAMS = 3
-"""Number of episodes: a row, and two others in its batch."""
+REPLAN = 3  # default actions per chunk, so that a short stream has several chunks
+STREAMS = 3  # number of episodes: a row, and two others in its batch
 KEYS = ("policy", "dataset", "obs_type")
 
-Actions = NDArray[np.float32]
-"""Actions (calls, rows, A) of a policy."""
+Actions = NDArray[np.float32]  # actions (calls, rows, A) of a policy
 
 
 @dataclass

@@ -35,8 +35,7 @@ MERGED_FILE = "episodes.jsonl"
 WRITTEN_AT = "written_at"
 """Key in the workers' files only: time of writing, s since 1970. The newest of several lines counts."""
 
-Key = tuple[str, int]
-"""Identity of an episode in its evaluation: task and number."""
+Key = tuple[str, int]  # identity of an episode in its evaluation: task and number
 
 # --- lines ---
 
