@@ -159,10 +159,7 @@ class EnvSettings:
         usual="the policy's",
     )
     window_steps: int = setting(
-        1,
-        "control steps of observations in an input of a policy without a memory",
-        least=1,
-        usual="the policy's",
+        1, "control steps of observations in an input of a policy without a memory", least=1, usual="the policy's"
     )
     delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
     render: str = setting("default", "high is for figures and four times slower", QUALITIES)
