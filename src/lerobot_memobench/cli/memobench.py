@@ -57,8 +57,7 @@ def tasks(
     as_json: AsJson = False,
     suite: SuiteOption = PUBLISHED,
     folder: Annotated[
-        Path | None,
-        typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
+        Path | None, typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue.")
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
@@ -170,9 +169,7 @@ def assets(
 # --- train ---
 
 
-def recipe(
-    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
-) -> int:
+def recipe(name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None) -> int:
     """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
     from lerobot_memobench.commands.command_line import recipe_file, recipes
 
