@@ -175,6 +175,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate((*RATES, RELIABLE))}
     decided, of_draws = 1 - rates[2], 1 - drawn[:, 2]
     if decided > 0:
+        # A draw without any answer has no such rate.
         right = drawn[of_draws > 0, 0] / of_draws[of_draws > 0]
         estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1

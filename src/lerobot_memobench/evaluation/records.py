@@ -138,6 +138,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     names = folder_names([folder for _, folder in labelled])
     runs = []
     for (label, folder), name in zip(labelled, names, strict=True):
+        # An evaluation of several suites has a folder of each.
         suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
         runs.append(_joined([read_run(folder / suite, name, label or "") for suite in suites or ("",)]))
     first = runs[0].suites[0]
@@ -160,7 +161,7 @@ def _joined(parts: Sequence[Run]) -> Run:
     if len(parts) == 1:
         return parts[0]
     parts = sorted(parts, key=lambda part: GROUPS.index(part.suites[0]))
-    for a, b in pairwise(parts):
+    for a, b in pairwise(parts):  # in the order of suites, equal ones are neighbours
         if a.suites == b.suites or _policy(a) != _policy(b):
             same = f"the suite {a.suites[0]}" if a.suites == b.suites else "other policies"
             raise MemobenchError(
