@@ -166,7 +166,6 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
 
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     """Return the mean over groups of the means over their tasks, with intervals over scenes."""
-
     tasks = [task for group in groups for task in group]
     rates = nested_mean([[task.values.mean(axis=0) for task in group] for group in groups])
     drawn = nested_mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
