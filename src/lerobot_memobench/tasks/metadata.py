@@ -116,8 +116,6 @@ class Metadata:
             return ()
         labels = self.data["operating_type"]
         self._check_count("operating_type", labels)
-        if "key_frame" in self.data:
-            self._check_count("key_frame", self.data["key_frame"])
         formulas = self._formulas(self.data["subtask_goals"], "subtask_goals")
         operations = [(OPERATIONS[a], OPERATIONS[b], OPERATIONS[c]) for a, b, c in labels]
         texts = self._texts(self.data["memory"], "memory")
