@@ -30,10 +30,7 @@ HOME = Atom("handhome", ())
 
 
 def cue_to_use_of(task: Task, seed: int) -> tuple[bool, list[int | None]]:
-    """Run the expert on one episode; return its success and the steps of each checkpoint, without held steps.
-
-    They are None if the checkpoint was not reached or nothing before it has to be remembered.
-    """
+    """Return success and the cue-to-use times of checkpoints without held steps; None: not reached, or no cue."""
     episode = Episode(task, referent="random")
     episode.reset(seed)
     cues = _prompt_cues(episode)
@@ -81,7 +78,6 @@ def _prompt_cues(episode: Episode) -> list[int]:
 
 
 def _scene(episode: Episode) -> NDArray[np.float64]:
-    """Return the positions of all joints, m or rad, and objects, m."""
     sim = episode.sim
     joints = [sim.world.articulation(name)[1] for name in sorted(sim.world.joints)]
     return np.array([*joints, *(x for name in episode.task.objects for x in sim.body_pose(name)[0])])

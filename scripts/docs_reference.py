@@ -60,7 +60,8 @@ PUBLIC = {
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summary_of report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Contrast compare_evaluations"),
+    "Comparison": ("evaluation.comparison", "Comparison compare_evaluations"),
+    "Contrast": ("evaluation.statistics", "Contrast"),
     "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
@@ -343,7 +344,6 @@ def typed_rows(kind: Any) -> list[list[str]]:
 
 
 PROTOCOL_ONLY = {
-    "world": "`libero`; absent for the scenes of version 0.2, a list for a log of both",
     "hold": "mean of the drawn holds of a strict task, control steps",
     "goals": "revision of the goals of strict tasks",
     "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",
@@ -353,16 +353,22 @@ PROTOCOL_ONLY = {
 
 
 def meanings(kind: Any) -> dict[str, str]:
-    """Return field -> meaning from the docstrings of a `TypedDict` and its bases."""
+    """Return field -> meaning from the comments of a `TypedDict`, above a field or behind it."""
     meaning: dict[str, str] = {}
-    for base in getattr(kind, "__orig_bases__", ()):
-        meaning |= meanings(base)
     if "horizon" in kind.__annotations__:
         from lerobot_memobench.envs.settings import EnvSettings
 
         meaning |= {field.name: field.metadata["meaning"] for field in dataclasses.fields(EnvSettings)}
         meaning |= PROTOCOL_ONLY
-    return meaning | arguments(inspect.getdoc(kind) or "")
+    above: list[str] = []
+    for line in inspect.getsource(kind).splitlines():
+        if comment := re.fullmatch(r" {4}# (.*)", line):
+            above.append(comment[1])
+        elif field := re.fullmatch(r" {4}(\w+): [^#]*(?:  # (.*))?", line):
+            if text := plain(" ".join([*above, field[2] or ""])):
+                meaning[field[1]] = text
+            above = []
+    return meaning
 
 
 def type_name(hint: Any) -> str:
@@ -622,10 +628,7 @@ LINK = re.compile(r"\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
 
 
 def relink(markdown: str, source: str, page: str) -> str:
-    """Return Markdown of the repository's file ``source`` with its links adapted to the site's page ``page``.
-
-    Links to files outside the site become the path as code.
-    """
+    """Return Markdown of the file ``source`` as the site's page ``page``; links that leave the site become paths."""
     folder = posixpath.dirname(page) or "."
 
     def adapt(match: re.Match[str]) -> str:
