@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -90,17 +90,6 @@ def _resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
     return resolved
 
 
-class TextEncoder(Protocol):
-    """Frozen text encoder: texts -> embeddings (N, dim) float32."""
-
-    @property
-    def dim(self) -> int:
-        """Width of an embedding."""
-
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode."""
-
-
 # --- lookup ---
 
 Columns = Mapping[str, Tensor]  # column -> its numbers (N, ...) of every frame, in the order of the global index
@@ -132,7 +121,7 @@ class FrameLookup:
         table: FrameTable,
         *,
         stride: int = 1,
-        texts: TextEncoder | None = None,
+        texts: Callable[[Sequence[str]], Tensor] | None = None,
         remember: Remember | None = None,
         columns: Columns | None = None,
         encoded: Mapping[str, Encoded] | None = None,
@@ -146,8 +135,7 @@ class FrameLookup:
         self._subgoal_rows = {
             level: _resolve_subgoals(np.array(column, np.int32), table.episodes) for level, column in rows.items()
         }
-        width = 0 if texts is None else texts.dim
-        self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0, width)
+        self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0)
         self.memories: list[str] = []
         self._memory_rows: np.ndarray | None = None
         if table.memory is not None:  # as objects: NumPy's own texts would each be as wide as the longest
