@@ -6,7 +6,7 @@ An episode's file names and bytes depend on the episode alone, never on the work
 
 ::
 
-    <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
+    <staging>/episodes/000012/episode.json        identity, digest, statistics
                               arrays.npz          states, actions, proprio, label columns (no pickle)
                               image.mp4, wrist_image.mp4
 
@@ -33,10 +33,10 @@ from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole
 from lerobot_memobench.datasets.layout import MANIFEST_FILE, STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError, short
-from lerobot_memobench.io import file_hash, flush_to_disk, refuse_links, remove_drafts, write_file
+from lerobot_memobench.io import flush_to_disk, refuse_links, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
-from lerobot_memobench.untrusted import read_json
+from lerobot_memobench.untrusted import read_json, refusing
 
 TEMPORARY = ".tmp-"
 EPISODE_FILE = "episode.json"
@@ -56,14 +56,12 @@ class StagedEpisode(BaseModel):
         info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
             episode at least its task's name and seed.
         image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
-        files: name to sha256 of the other files.
     """
 
     failure: str | None
     info: dict[str, Any]
     language_persistent: list[LanguageRow]
     image_stats: dict[str, dict[str, Any]]
-    files: dict[str, str]
     folder: Path = Field(Path(), exclude=True)
 
     @property
@@ -88,19 +86,10 @@ class StagedEpisode(BaseModel):
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
-        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+        path = self.folder / ARRAYS_FILE
+        damaged = refusing(lambda why: MemobenchError(f"{path} cannot be read ({why}); {ADVICE}"))
+        with damaged, np.load(path, allow_pickle=False) as data:
             return dict(data)
-
-    def check(self) -> None:
-        """Raise a MemobenchError that names the first file whose hash differs from the recorded one."""
-        for name, expected in self.files.items():
-            path = self.folder / name
-            digest = file_hash(path) if path.is_file() else "missing"
-            if digest != expected:
-                raise MemobenchError(
-                    f"{path} is damaged (sha256 {digest[:12]}, written as {expected[:12]}); delete the folder "
-                    f"{self.folder} and repeat the command to make this episode again"
-                )
 
 
 def read_staged(folder: Path) -> StagedEpisode | None:
@@ -196,12 +185,7 @@ class EpisodeStage:
         self, info: dict[str, Any], failure: str | None, rows: list[LanguageRow], image_stats: dict[str, Any]
     ) -> StagedEpisode:
         episode = StagedEpisode(
-            failure=failure,
-            info=info,
-            language_persistent=rows,
-            image_stats=image_stats,
-            files={path.name: file_hash(path) for path in sorted(self._temporary.iterdir())},
-            folder=self._folder,
+            failure=failure, info=info, language_persistent=rows, image_stats=image_stats, folder=self._folder
         )
         (self._temporary / EPISODE_FILE).write_text(episode.model_dump_json())
         flush_to_disk(*self._temporary.iterdir(), self._temporary)  # a complete folder never has incomplete files

@@ -103,9 +103,6 @@ def assemble(
         raise MemobenchError(
             f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
         )
-    for episode in written:
-        episode.check()
-
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     versions = (manifest or {}).get("request", {}).get("versions")
