@@ -307,17 +307,12 @@ STRANGER = (
 
 @dataclass(frozen=True)
 class ListedEpisode:
-    """An episode of a dataset, without its frames.
-
-    Attributes:
-        start: first frame in the dataset's global index.
-        record: None if this package wrote none.
-    """
+    """An episode of a dataset, without its frames."""
 
     index: int
-    start: int
+    start: int  # first frame in the dataset's global index
     length: int
-    record: DemonstrationRecord | None
+    record: DemonstrationRecord | None  # None if this package wrote none
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:

@@ -25,21 +25,13 @@ _PLACE = ("index", "episode_index", "frame_index")
 
 @dataclass
 class FrameTable:
-    """Phases and texts of a dataset of E episodes and N frames.
+    """Phases and texts of a dataset of E episodes and N frames."""
 
-    Attributes:
-        episodes: (E + 1,) int64, first frame of each episode, and N.
-        phase: (N,) uint8.
-        held: (N,) bool, whether the scene is held in the execution.
-        subgoals: level to (N,) texts.
-        memory: (N,) oracle memory texts; None without this column.
-    """
-
-    episodes: np.ndarray
-    phase: np.ndarray
-    held: np.ndarray
-    subgoals: dict[str, list[str]]
-    memory: list[str] | None
+    episodes: np.ndarray  # (E + 1,) int64, first frame of each episode, and N
+    phase: np.ndarray  # (N,) uint8
+    held: np.ndarray  # (N,) bool, whether the scene is held in the execution
+    subgoals: dict[str, list[str]]  # level to (N,) texts
+    memory: list[str] | None  # (N,) oracle memory texts; None without this column
 
     @property
     def num_episodes(self) -> int:
