@@ -94,17 +94,6 @@ class FrameLookup:
     """Phase, texts, recorded numbers and remembered features of every frame of a dataset.
 
     1,500 episodes of 500 frames with the slots of objects take 0.7 GiB of main memory.
-
-    Args:
-        stride: distance between remembered frames.
-        texts: encoder of the subgoals; None: they have no embeddings.
-        remember: features of remembered frames; None: frames are not remembered.
-        columns: recorded numbers for training samples; None: LeRobot makes the samples.
-        encoded: name in a training sample -> features of the present frame.
-
-    Attributes:
-        runs: first frames of the parts of episodes between holds, and of the holds, and N.
-        texts, memories: distinct subgoals, whose embeddings are ``text_embeddings``, and distinct oracle memory texts.
     """
 
     def __init__(
@@ -112,15 +101,16 @@ class FrameLookup:
         root: Path,
         table: FrameTable,
         *,
-        stride: int = 1,
-        texts: Callable[[Sequence[str]], Tensor] | None = None,
-        remember: Remember | None = None,
-        columns: Columns | None = None,
-        encoded: Mapping[str, Encoded] | None = None,
+        stride: int = 1,  # distance between remembered frames
+        texts: Callable[[Sequence[str]], Tensor] | None = None,  # encoder of the subgoals; None: without embeddings
+        remember: Remember | None = None,  # None: frames are not remembered
+        columns: Columns | None = None,  # for training samples; None: LeRobot makes the samples
+        encoded: Mapping[str, Encoded] | None = None,  # name in a training sample -> features of the present frame
     ) -> None:
         self.root, self.stride = root, stride
         self.episodes, self.phase, self.acts = table.episodes, table.phase, table.acts
-        self.runs = table.runs(table.held)
+        self.runs = table.runs(table.held)  # first frames of the parts of episodes between holds, and of the holds
+        # Distinct subgoals, whose embeddings are `text_embeddings`; `memories` are the distinct oracle memory texts.
         self.texts = sorted({text for values in table.subgoals.values() for text in values if text})
         number = {text: row for row, text in enumerate(self.texts)}
         rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
@@ -221,23 +211,15 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
 
 
 class SamplesInMemory(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their rows, from columns in main memory, without images.
-
-    Args:
-        columns: name -> numbers (N, ...).
-        bounds: first rows of the stretches in which a sample takes its other steps, and N.
-        steps: name of a column -> its steps in a sample, relative to the sample's row.
-        tasks: instructions by ``task_index``.
-        texts: name -> further values (N,).
-    """
+    """LeRobot's samples by their rows, from columns in main memory, without images."""
 
     def __init__(
         self,
-        columns: Mapping[str, Tensor],
-        bounds: np.ndarray,
-        steps: Mapping[str, Sequence[int]],
-        tasks: Sequence[str],
-        texts: Mapping[str, pa.Array] | None = None,
+        columns: Mapping[str, Tensor],  # name -> numbers (N, ...)
+        bounds: np.ndarray,  # first rows of the stretches in which a sample takes its other steps, and N
+        steps: Mapping[str, Sequence[int]],  # name of a column -> its steps in a sample, relative to the sample's row
+        tasks: Sequence[str],  # instructions by `task_index`
+        texts: Mapping[str, pa.Array] | None = None,  # name -> further values (N,)
     ) -> None:
         self._columns, self._texts, self._tasks = columns, texts or {}, tasks
         self._bounds = torch.from_numpy(bounds)

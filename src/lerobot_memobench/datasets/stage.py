@@ -51,17 +51,14 @@ ADVICE = "it is damaged; delete its folder and run the command again"
 class StagedEpisode(BaseModel):
     """``episode.json`` of a finished episode in ``folder``; arrays and videos are read on demand.
 
-    Attributes:
-        failure: why there is no demonstration of this seed, or None.
-        info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
-            episode at least its task's name and seed.
-        image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
+    ``info`` is the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
+    episode at least its task's name and seed.
     """
 
-    failure: str | None
+    failure: str | None  # why there is no demonstration of this seed
     info: dict[str, Any]
     language_persistent: list[LanguageRow]
-    image_stats: dict[str, dict[str, Any]]
+    image_stats: dict[str, dict[str, Any]]  # name of a camera's video to the statistics of its pixels
     folder: Path = Field(Path(), exclude=True)
 
     @property
