@@ -83,6 +83,7 @@ class PublishedFile:
             self.announced = int(announced) if isinstance(announced, int | np.integer) else None
             self.bddl_name = _text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = _text_attribute(data, "bddl_file_content", required=True)
+            self.lacks_its_text = _is_file_object(self.bddl_text)
         except Exception as error:
             self._file.close()
             if isinstance(error, MemobenchError):
@@ -94,11 +95,6 @@ class PublishedFile:
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
-
-    @property
-    def lacks_its_text(self) -> bool:
-        """Whether the task's text is replaced by the name of an open file."""
-        return _is_file_object(self.bddl_text)
 
     def attribute(self, name: str) -> str | None:
         """Return a text attribute of the group ``data``, or None."""
