@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
 from lerobot_memobench.datasets.layout import MANIFEST_FILE, STAGING, TOP_LEVEL, image_key, is_dataset
@@ -200,9 +199,9 @@ class EpisodeStage:
 def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
     """Write a demonstration in memory, with its images, to ``folder``; an equal one that exists already is kept."""
     with EpisodeStage(folder, convention) as stage:
-        for frame in range(len(demo) if demo.images is not None else 0):
-            assert demo.images is not None
-            stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
+        images = demo.images or {}
+        for frames in zip(*images.values(), strict=True):
+            stage.add_images(dict(zip(images, frames, strict=True)))
         return stage.publish(demo)
 
 
