@@ -111,7 +111,7 @@ class Demonstration:
         if not 0 <= self.exec_start < length:
             yield f"execution starts at frame {self.exec_start} of {length}; expected one of the episode's frames"
         if self.satisfied[: self.exec_start].any():
-            yield f"a checkpoint is satisfied in the prompt, before execution starts at frame {self.exec_start}"
+            yield f"a checkpoint is satisfied in the demonstration prompt, before frame {self.exec_start}"
 
     def __len__(self) -> int:
         """Return T, demonstration prompt included."""
