@@ -422,7 +422,7 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     import torch
 
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if rename is None or type(policy).__module__.startswith(f"{__package__}."):
+    if rename is None:
         return shapes
     tensors = rename({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
     return {f"model.{name.removeprefix('model.')}": tuple(tensor.shape) for name, tensor in tensors.items()}
