@@ -94,8 +94,7 @@ class MemoryPI05(nn.Module):
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         super().__init__()
-        self.config, self.gradient_checkpointing_enabled = config, False
-        dims = config.dimensions
+        self.config, dims = config, config.dimensions
         width, vlm_width = dims.expert.width, dims.vlm.width
         self.paligemma_with_expert: Any = make_backbone(config)
         self.action_in_proj = nn.Linear(config.max_action_dim, width)
@@ -199,7 +198,7 @@ class MemoryPI05(nn.Module):
         return velocity
 
     def _call_layer(self, layer: Callable[..., Any], *inputs: Any) -> Any:
-        if self.gradient_checkpointing_enabled and self.training:
+        if self.config.gradient_checkpointing and self.training:
             return checkpoint(layer, *inputs, use_reentrant=False, preserve_rng_state=False)
         return layer(*inputs)
 
@@ -226,10 +225,6 @@ class MemoryPI05(nn.Module):
         return euler_integrate(lambda x, time: self.velocity(x, next(modulations), past, memory), noise, steps)
 
     # -- parameters --------------------------------------------------------------------------------------------------
-
-    def gradient_checkpointing_enable(self) -> None:
-        self.gradient_checkpointing_enabled = True
-        self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing = True
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return the parameters that plain pi0.5 does not have, by name."""
