@@ -20,7 +20,7 @@ from lerobot_memobench.envs.evaluation_file import Acting, differences, facts_of
 from lerobot_memobench.evaluation.comparison import ALLOWED
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import plan_line
-from lerobot_memobench.rollouts.settings import card_settings
+from lerobot_memobench.rollouts.plan import card_settings
 from tests.support.scripts import load_script
 
 line = ["env=memobench", "policy=memobench_random", "episodes=1", "tasks=1"]

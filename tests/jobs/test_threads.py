@@ -135,7 +135,7 @@ def test_child_processes_decide_again(machine: Machine, environment: dict[str, s
     threads.use_threads(LEARNING)
     assert "OMP_NUM_THREADS" not in environment
     assert "GOMP_SPINCOUNT" not in environment
-    environment.update(sharing(4, {}))
+    environment.update(sharing(4))
     threads.use_threads(LEARNING)
     assert environment["OMP_NUM_THREADS"] == "4"
     assert environment["LP_NUM_THREADS"] == "1"

@@ -34,7 +34,6 @@ def made(std: float = 0.5, **changed: Any) -> FastWeights:
 
 
 def normed(x: Tensor, norm: torch.nn.LayerNorm) -> Tensor:
-    """Return the layer norm of a vector (D,)."""
     return (x - x.mean()) / (x.var(unbiased=False) + 1e-6).sqrt() * norm.weight + norm.bias
 
 
@@ -64,7 +63,6 @@ def written(
             rates[token, head].detach() * (rms(key @ weight + bias) - (value - key)).square().sum() / 2
             for token, (key, value) in enumerate(zip(keys, values, strict=True))
         )
-        assert isinstance(loss, Tensor)
         moved = []
         for old, gradient in zip((weight, bias), torch.autograd.grad(loss, (weight, bias)), strict=True):
             lengths.append(float(gradient.norm()))
@@ -98,7 +96,6 @@ def test_weights_equal_their_formula(std: float) -> None:
             torch.testing.assert_close(state["bias"][row, head, 0], bias, rtol=1e-5, atol=1e-5)
         expected = mechanism.out(torch.cat(outputs[-FRAMES_READ:]))
         torch.testing.assert_close(read.each[row], expected, rtol=1e-5, atol=1e-5)
-    assert read.steps is not None
     assert read.steps[0].tolist() == [16 * frame for frame in range(2, count) for _ in range(3)]
     assert (shortened > 0) == (std > 1)
 
@@ -119,7 +116,6 @@ RECURRENT_SPEC = MemorySpec(dim=32, tokens=3, width=32, expert=16, grid=0, strid
 
 
 def made_recurrent(**changed: Any) -> recurrent.Recurrent:
-    """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
     mechanism = recurrent.Recurrent(
         RECURRENT_SPEC, torch.nn.Identity(), mechanism_settings("recurrent", changed)

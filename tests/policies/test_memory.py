@@ -175,10 +175,7 @@ def test_packages_that_add_a_broken_memory_are_named(
         EntryPoint("frames", "pathlib:Path", memory.GROUP),
     ]
     monkeypatch.setattr(memory, "entry_points", lambda group: added if group == memory.GROUP else [])
-    for name, named in (
-        ("gone", "no_such_package"),
-        ("twice", "another:Memory.*one_package:Memory"),
-    ):
+    for name, named in (("gone", "no_such_package"), ("twice", "another:Memory.*one_package:Memory")):
         with pytest.raises(MemobenchError, match=f"'{name}'.*{named}"):
             find_mechanism(name)
     assert find_mechanism.__wrapped__("frames") is FrameSampling

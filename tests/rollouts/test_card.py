@@ -141,12 +141,12 @@ def test_equal_runs_are_counted() -> None:
 def test_a_card_is_widened() -> None:
     old = card(shard="1/2")
     wide = card(protocol={"tasks": ["b"], "episodes": 5, "seed_base": 7}, task_files={"b": "2"}, shard="2/2")
-    both = extended(old, wide)
+    both = extended(old, wide, Path("old"))
     assert (both["protocol"]["tasks"], both["protocol"]["episodes"]) == (["a", "b"], 5)
     assert (both["protocol"]["horizon"], both["task_files"]) == (1200, {"a": "1", "b": "2"})
     assert both["settings"] == {"env": {"tasks": "a,b"}, "policy": {"type": "act"}}
     assert (both["runs"][0]["times"], both["shard"]) == (2, None)
-    assert extended(old, old)["shard"] == "1/2"
+    assert extended(old, old, Path("old"))["shard"] == "1/2"
 
 
 @pytest.mark.parametrize(

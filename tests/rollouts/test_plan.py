@@ -23,14 +23,13 @@ from lerobot_memobench.rollouts.card import card_of, run_facts
 from lerobot_memobench.rollouts.plan import (
     EvaluationPlan,
     Grid,
-    PlannedTask,
     RunOptions,
     Shard,
+    card_settings,
     make_plan,
     plan_line,
     take_run_options,
 )
-from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 from tests.support.logs import card
@@ -302,7 +301,7 @@ def test_run_options_are_taken_out_of_the_arguments() -> None:
 
 
 def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:
-    return Grid(tuple(PlannedTask("temporal", k, Path(name)) for k, name in enumerate(tasks)), runs, batch, first)
+    return Grid(tuple(map(Path, tasks)), runs, batch, first)
 
 
 def test_batches_are_not_divided() -> None:

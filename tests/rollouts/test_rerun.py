@@ -18,11 +18,11 @@ from lerobot_memobench.envs.episode_log import read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
-from lerobot_memobench.perception.weights import SHIPPED
+from lerobot_memobench.perception.detector import SHIPPED
 from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.plan import EvaluationSettings, card_settings, plan_line
 from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
@@ -30,7 +30,6 @@ from lerobot_memobench.rollouts.rerun import (
     plan_of_evaluation,
     read_repeatable,
 )
-from lerobot_memobench.rollouts.settings import EvaluationSettings, card_settings
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
@@ -140,11 +139,11 @@ def test_a_card_names_only_a_server_of_this_machine() -> None:
 def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun, "local_folder", lambda path: Path("checkpoint") if path == "user/name" else None)
     asked = allowed(policy={"path": "user/name"})
-    assert asked.policy_path == str(Path("checkpoint").absolute())
+    assert asked.policy["path"] == str(Path("checkpoint").absolute())
     facts = {"sha256": tree_hash(checkpoint_files(Path("checkpoint")))}
     seeing = {"settings": {"perception": "objects", "detector": "package"}, "detector_sha256": file_hash(SHIPPED)}
     for known in (facts, facts | seeing):
-        check_policy({"policy": known}, asked.policy_path)
+        check_policy({"policy": known}, asked.policy["path"])
     for other, named in (
         ({}, "checkpoint"),
         (facts | {"sha256": "0" * 64}, "checkpoint"),
@@ -152,7 +151,7 @@ def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.Monke
         (facts | {"settings": seeing["settings"]}, "detector package"),
     ):
         with pytest.raises(MemobenchError, match=named):
-            check_policy({"policy": other}, asked.policy_path)
+            check_policy({"policy": other}, asked.policy["path"])
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 """Load the weights of a checkpoint, and check that its processor steps agree with the configuration.
 
-The model file holds the averaged weights; `training.average` saves the trained weights next to it.
+The model file holds the averaged weights; `training.loop` saves the trained weights next to it.
 """
 
 from __future__ import annotations

@@ -21,8 +21,8 @@ from lerobot_memobench.datasets.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.perception.detector import PACKAGE
 from lerobot_memobench.perception.visual_encoder import SIDE
-from lerobot_memobench.perception.weights import PACKAGE
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,

@@ -20,8 +20,12 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.constants import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.weights import load_visual_encoder
-from lerobot_memobench.policies.checkpoint import as_trained, check_as_trained, check_processor_statistics
+from lerobot_memobench.perception.detector import load_visual_encoder
+from lerobot_memobench.policies.checkpoint import (
+    as_trained,
+    check_as_trained,
+    check_processor_statistics,
+)
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,

@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.perception.detector import load_detector
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
-from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     TOKEN_SCALE,
@@ -379,7 +379,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
 def _make_encoder(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
     width, camera, thumbnails = config.dimensions.vlm.width, config.memory_camera or "", config.remembers_thumbnails
     if config.uses_visual_encoder:
-        tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
+        tower = vlm.vision_tower = VisualEncoder().fold().eval().requires_grad_(False)
         vlm.multi_modal_projector = nn.Identity()
         return VisualTokenEncoder(tower, [*config.image_features], camera, width, thumbnails)
     if not config.uses_objects:
