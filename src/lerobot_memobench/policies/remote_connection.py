@@ -239,8 +239,7 @@ _OPENPIS = b"__ndarray__", b"data", b"dtype", b"shape"
 
 def pack(message: dict[str, Any]) -> bytes:
     """Pack a message as openpi-client does: arrays are maps of their bytes, type and shape."""
-    packed: bytes = msgpack.packb(message, default=_pack)
-    return packed
+    return msgpack.packb(message, default=_pack)
 
 
 def _pack(value: Any) -> Any:

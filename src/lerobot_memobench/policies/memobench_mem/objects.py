@@ -352,5 +352,4 @@ def in_order(slots: Tensor) -> Tensor:
     first = torch.where(kind == classes().index("drawer"), -position[..., 2], position[..., 0])  # drawers from the top
     # Classes are whole numbers, and a place adds less than half of one.
     order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
-    rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
-    return rows
+    return slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))

@@ -151,8 +151,7 @@ class FrameSampling(MemoryMechanism):
         else:
             tokens = self.pool(frames)
             tokens = tokens if self.settings.content else torch.zeros_like(tokens)
-        encoded: Tensor = self.encoder(tokens, steps)
-        return encoded
+        return self.encoder(tokens, steps)
 
     def _tokens(self, encoded: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
         mask, steps = (repeat(of_frames, "b f -> b (f p)", p=self.spec.tokens) for of_frames in (real, steps))
