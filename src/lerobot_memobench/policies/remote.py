@@ -126,7 +126,6 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def prompt_stride(self) -> int:
-        """Steps between sent frames of the prompt."""
         kind = self.connection
         return 1 if kind.buffers else self.history_every or kind.prompt_stride or self.n_action_steps
 

@@ -217,7 +217,6 @@ class RoboMMEConnection(Connection):
         self._frames.append(frame)
 
     def plan(self, frame: NamedValues) -> dict[str, Any]:
-        """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
         self.ask(
             {

@@ -133,7 +133,6 @@ class FrameSampling(MemoryMechanism):
         return [row for state in states for row in state]
 
     def noised(self, state: State, generator: torch.Generator) -> State:
-        """Return the frames with noise on their memory tokens."""
         seed = generator.initial_seed()
         return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
 
