@@ -20,7 +20,6 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.lerobots_trainer import trainer_in_this_process
 from tests.support.tiny_paligemma import shrink_paligemma
 from tests.support.tiny_smolvlm import tiny_smolvlm
 
@@ -60,8 +59,7 @@ def save(folder: Path, kind: str, cameras: dict[str, int], state: int, **setting
 def train(policy: Path, dataset: Path, run: Path, *words: str) -> Path:
     """Continue training for two updates; return the checkpoint."""
     usual = ("steps=2", "batch_size=2", "num_workers=0", "save_freq=2", "policy.device=cpu")
-    with trainer_in_this_process():
-        assert main(["train", f"policy={policy}", f"dataset={dataset}", f"output_dir={run}", *usual, *words]) == 0
+    assert main(["train", f"policy={policy}", f"dataset={dataset}", f"output_dir={run}", *usual, *words]) == 0
     return run / "checkpoints" / "last" / "pretrained_model"
 
 
