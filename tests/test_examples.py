@@ -25,7 +25,7 @@ from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
 from tests.support import logs
 from tests.support.libero import simulate
-from tests.support.remote_case import batch
+from tests.support.policy_server import batch
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -20,10 +20,9 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episodes, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import Rate, report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, line_style
-from lerobot_memobench.evaluation.records import Run, read_runs
+from lerobot_memobench.evaluation.records import Run, headline, read_runs
 from lerobot_memobench.evaluation.report import best_interval, evaluation_report, write_report
 from lerobot_memobench.evaluation.tables import (
     WIDTH,
@@ -32,12 +31,11 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    best_in_columns,
     csv_tables,
     csv_text,
     to_markdown,
 )
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
+from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 from tests.support import logs
 
@@ -219,10 +217,8 @@ def test_markdown_escapes_all_text() -> None:
 
 
 def test_terminal_tables(sweep: list[Run]) -> None:
-    with pytest.raises(ValueError, match="1 cells for 2 columns"):
-        Table("t", "", ("a", "b"), (("x",),))
     rows = (("x", Rate(0.5, 4), Rate(None, 0)), ("y", Rate(0.5, 8), Rate(0.1, 4)))
-    assert best_in_columns(rows) == {(0, 1), (1, 1), (1, 2)}
+    assert Table("t", "", ("a", "b", "c"), rows, mark_best=True).best == {(0, 1), (1, 1), (1, 2)}
     text = WRITERS["table"](evaluation_report(sweep))
     assert max(map(len, text.splitlines())) <= WIDTH
     assert "75.0 [30.1–95.4]" in text

@@ -16,7 +16,7 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import disagreement
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
+from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts.card import (
     extended,
     joined_runs,

@@ -15,11 +15,11 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.rollouts.plan import EvaluationPlan, plan_line
-from lerobot_memobench.tasks.libero_suites import libero_tasks
+from lerobot_memobench.tasks.catalogue import task_names
 from tests.support.fake_loop import FakeLoop, content, make_checkpoint, results
 from tests.support.logs import write_log
 
-SOUP, CHEESE = libero_tasks("libero_object")[:2]
+SOUP, CHEESE = task_names(suite="libero_object")[:2]
 RANDOM = ["env=memobench", "policy=memobench_random"]
 LINE = [*RANDOM, "suite=libero_object", "tasks=0,1", "episodes=4", "batch_size=2"]
 COMMAND = ["eval", *LINE]
@@ -189,7 +189,7 @@ def test_evaluations_are_compared(fake_loop: FakeLoop, capsys: pytest.CaptureFix
 
 
 def test_tables_hold_ids_in_liberos_order(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
-    chosen = [libero_tasks("libero_object")[number] for number in (2, 7)]
+    chosen = [task_names(suite="libero_object")[number] for number in (2, 7)]
     assert sorted(chosen) == chosen[::-1], "the order of ids is not that of names"
     line = ["eval", *RANDOM, "task=libero_object", "task_ids=[2,7]", "episodes=2"]
     assert lerobot([*line, "output_dir=a"]) == 0

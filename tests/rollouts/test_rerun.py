@@ -18,8 +18,8 @@ from lerobot_memobench.envs.episode_log import read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
-from lerobot_memobench.perception.weights import SHIPPED
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
+from lerobot_memobench.perception.detector import SHIPPED
+from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import EvaluationSettings, card_settings, plan_line

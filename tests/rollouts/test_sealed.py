@@ -16,8 +16,7 @@ from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.envs.episode import Episode, generator, referent_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import headline, read_runs
 from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import card_settings, plan_line
 from lerobot_memobench.rollouts.rerun import plan_of_evaluation

@@ -115,7 +115,6 @@ def make_checkpoint(folder: Path, kind: str = "memobench_random", **config: Any)
 
 
 def content(folder: Path) -> dict[Path, bytes]:
-    """Return the bytes of every file below a folder."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

@@ -82,7 +82,6 @@ def test_held_out_loss_is_logged(objects: Path, tmp_path: Path, train: Callable[
 
 @pytest.fixture(scope="module")
 def begun(objects: Path, tmp_path_factory: pytest.TempPathFactory, train: Callable[..., None]) -> Path:
-    """A checkpoint of two updates."""
     out = tmp_path_factory.mktemp("begun") / "run"
     train("policy=memobench_mem", *SEEN["objects"], f"dataset={objects}", f"output_dir={out}", "steps=2")
     return out / "checkpoints/last/pretrained_model"

@@ -64,8 +64,7 @@ def test_stretches_between_prompts_and_holds_are_episodes(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("obs_type", "seen"),
-    [(PIXELS, {STATE, IMAGE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, IMAGE})],
+    ("obs_type", "seen"), [(PIXELS, {STATE, IMAGE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, IMAGE})]
 )
 def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], imaged: Path, tmp_path: Path) -> None:
     write_view(imaged, tmp_path / "view", ViewOptions(obs_type=obs_type))

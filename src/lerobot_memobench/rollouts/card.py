@@ -21,17 +21,15 @@ from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.threads import cores, cpu_model
 from lerobot_memobench.policies.checkpoint import (
     ADAPTER_FILE,
+    ELSEWHERE,
     TRAIN_CONFIG,
     WEIGHTS_FILE,
     TrainConfig,
-    local_folder,
-    portable_path,
-)
-from lerobot_memobench.policies.lerobot_config import (
-    ELSEWHERE,
     checkpoint_files,
     encoded_config,
     identity_of,
+    local_folder,
+    portable_path,
     tree_hash,
 )
 from lerobot_memobench.rollouts.plan import EvaluationPlan
@@ -107,7 +105,7 @@ def detector_hash(settings: Mapping[str, Any]) -> str | None:
     """Return the hash of the detector that a policy reads objects from, None without one; raise if it is missing."""
     if settings.get("detector") is None:
         return None
-    from lerobot_memobench.perception.weights import detector_file
+    from lerobot_memobench.perception.detector import detector_file
 
     return file_hash(detector_file(settings["detector"]))
 

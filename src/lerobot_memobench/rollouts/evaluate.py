@@ -33,8 +33,7 @@ from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.policies.checkpoint import check_weights, portable_path
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.checkpoint import check_weights, portable_path, quiet
 from lerobot_memobench.policies.memory_reads import MEMORY_READS, noting_reads
 from lerobot_memobench.rollouts.card import card_of, extended, with_checkpoint
 from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, Shard

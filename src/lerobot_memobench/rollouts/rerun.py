@@ -35,8 +35,7 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
-from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
+from lerobot_memobench.policies.checkpoint import checkpoint_files, has_device, local_folder, tree_hash
 from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
 from lerobot_memobench.rollouts.plan import (
     ENVIRONMENT,

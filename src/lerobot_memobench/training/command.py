@@ -21,12 +21,12 @@ from lerobot_memobench.commands.command_line import (
     TYPE,
     CommandSettings,
     as_command_line,
+    call_lerobot,
     read_words,
     resolve_recipe,
     value_of,
     without,
 )
-from lerobot_memobench.commands.lerobot_commands import call_lerobot
 from lerobot_memobench.datasets.episodes import naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
@@ -41,7 +41,9 @@ from lerobot_memobench.policies.checkpoint import (
     as_trained,
     check_as_begun,
     check_checkpoint,
+    check_device,
     check_processors,
+    check_sizes,
     check_weights,
     checkpoint_folder,
     checkpoint_type,
@@ -49,10 +51,10 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     local_folder,
     looks_local,
+    quiet,
     read_checkpoint_json,
     text_of_link,
 )
-from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
 from lerobot_memobench.untrusted import check_fetched
 
 if TYPE_CHECKING:

@@ -29,8 +29,8 @@ from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.perception.detector import load_detector, load_visual_encoder
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
-from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged_tensors
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -285,7 +285,7 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
         assert config.visual_encoder is not None  # the configuration has one
         tower = load_visual_encoder(config.visual_encoder)
     else:
-        tower = VisualEncoder(folded=True).eval()
+        tower = VisualEncoder().fold().eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
     return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)

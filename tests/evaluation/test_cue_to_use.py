@@ -1,4 +1,4 @@
-"""Gaps: the shipped figures cover the catalogue, and an evaluation is grouped by them."""
+"""Steps from cue to use: the shipped numbers cover the catalogue, and an evaluation is grouped by them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import pytest
 
 from lerobot_memobench.evaluation.plots import draw_figures, success_by_gap
 from lerobot_memobench.evaluation.records import read_runs
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.gap import gaps, longest_gap
+from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, longest_cue_to_use, task_names
 from tests.support.logs import rollout, write_log
 
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
@@ -19,13 +18,13 @@ HIDING = "find_the_tomato_hidden_in_one_of_the_drawers"
 @pytest.mark.parametrize("suite", ["published", "strict"])
 def test_every_checkpoint_of_the_catalogue_was_measured(suite: str) -> None:
     for task in map(get_task, task_names(suite=suite)):
-        found = gaps(task)
-        assert len(found) == len(task.checkpoints)
-        assert all(gap is None or 0 < gap.least <= gap.median <= gap.most for gap in found)
+        measured = cue_to_use(task)
+        assert len(measured) == len(task.checkpoints)
+        assert all(one is None or 0 < one.least <= one.median <= one.most for one in measured)
         # An instruction needs no memory, a prompt does.
-        assert (found[0] is None) == (task.prompt is None)
+        assert (measured[0] is None) == (task.prompt is None)
         if suite == "strict":
-            longest = longest_gap(task)
+            longest = longest_cue_to_use(task)
             assert longest is not None
             assert longest.median > 30
             assert longest.held == (task.prompt is not None)
