@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from lerobot_memobench.commands.command_line import parse_words
-from lerobot_memobench.envs.video import LAST_FRAMES, VideoRecorder
+from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.rollouts.plan import take_run_options
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.logs import rollout, write_log
@@ -86,26 +86,3 @@ def test_demo_writes_images_and_table(demo: SimpleNamespace, tmp_path: Path, mon
     means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
     assert (np.diff(means) >= 0).all(), "frames are in order of time"
     assert (means[0] < 20, means[-1] > 235) == (True, True), "first and last frames are included"
-
-
-def has_colour(image: np.ndarray, colour: tuple[int, int, int]) -> bool:
-    return bool((image == colour).all(axis=-1).any())
-
-
-def test_joined_videos_show_outcomes(demo: SimpleNamespace, tmp_path: Path) -> None:
-    takes = {
-        "with": demo.Take(video(tmp_path / "with.mp4", 5, 60), True),
-        "without": demo.Take(video(tmp_path / "without.mp4", 9, 200), False),
-    }
-    frames = list(demo.joined(takes))
-    assert len(frames) == 9 + LAST_FRAMES
-    assert frames[0].shape == (demo.TITLE + HEIGHT, 2 * WIDTH, 3)
-    left, right = frames[0][demo.TITLE :, :WIDTH], frames[0][demo.TITLE :, WIDTH:]
-    assert abs(float(left.mean()) - 60) < 4
-    assert abs(float(right.mean()) - 200) < 4
-    ends = [[has_colour(frame[: demo.TITLE], colour) for frame in frames] for colour in (demo.SOLVED, demo.FAILED)]
-    assert [end.index(True) for end in ends] == [5 + LAST_FRAMES - 1, 9 + LAST_FRAMES - 1]
-    image = np.asarray(demo.strip(takes))
-    assert image.shape == (2 * (demo.TITLE + demo.STRIP_WIDTH * HEIGHT // WIDTH), 6 * demo.STRIP_WIDTH, 3)
-    assert has_colour(image[: demo.TITLE], demo.SOLVED)
-    assert has_colour(image[len(image) // 2 :][: demo.TITLE], demo.FAILED)

@@ -23,13 +23,6 @@ published_rows, RAW = PUBLISHED["published_rows"], PUBLISHED["RAW"]
 ROWS = published_rows()
 
 
-def test_every_table_is_there() -> None:
-    sizes = {table: len(published_rows(table)) for table in ("main", "alignment", "oracle", "memer")}
-    assert sizes == {"main": 24, "alignment": 16, "oracle": 2, "memer": 1}
-    assert len(ROWS) == 43
-    assert published_rows("memer")[0].replan_steps is None
-
-
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.table}-{row.model}-{row.replan_steps}")
 def test_published_averages_are_the_mean_of_applicable_memory_types(row: Any) -> None:
     assert tuple(row.memory_types) == MEMORY_TYPES
@@ -47,15 +40,6 @@ def test_an_operation_is_published_where_the_catalogue_has_it() -> None:
         for row in ROWS:
             published = {m for m, value in row.memory_types[memory_type].items() if value is not None}
             assert published == {"SR"} | {f"M{operation}R" for operation in operations}
-
-
-def test_the_memory_module_is_the_same_row_in_both_tables() -> None:
-    main = [row for row in published_rows("main") if "Module" in row.model]
-    alignment = [row for row in published_rows("alignment") if row.model == "Memory module"]
-    assert [(row.replan_steps, row.memory_types) for row in main] == [
-        (row.replan_steps, row.memory_types) for row in alignment
-    ]
-    assert published_rows("oracle")[0].memory_types == ROWS[1].memory_types
 
 
 def test_the_text_quotes_the_tables() -> None:
