@@ -21,7 +21,6 @@ from tests.support.board import (
     ABOUT,
     SALT,
     evaluation,
-    first_failure,
     in_card,
     in_log,
     scene_of,
@@ -132,7 +131,6 @@ def relabelled(folder: Path) -> None:
 
 STRICT: dict[str, tuple[Change, str]] = {
     # steps that no execution can have
-    "one checkpoint at once": (one(lambda record: record["checkpoints"][0].update(first_step=2)), "from step 20 on"),
     "longer than the horizon": (failures(lambda record: record.update(steps=1300)), "at most 1200"),
     "order without checkpoints": (
         one(lambda record: marked(record, firsts(record), [None] * len(record["checkpoints"]))),
@@ -142,10 +140,6 @@ STRICT: dict[str, tuple[Change, str]] = {
         one(lambda record: record["checkpoints"][0].update(ordered_step=firsts(record)[0] + 10)),
         "in order at",
     ),
-    "order without a first step": (
-        in_log(lambda log: first_failure(log)["checkpoints"][0].update(ordered_step=300)),
-        "at step None and in order at 300",
-    ),
     # ends that no execution can have
     "given up early": (failures(lambda record: record.update(steps=900, lost=False)), "ended after 900 of 1200"),
     "cut off by a horizon": (failures(lambda record: record.update(failure="cut_off")), "the failure class cut_off"),
@@ -153,27 +147,16 @@ STRICT: dict[str, tuple[Change, str]] = {
         failures(lambda record: record.update(failure="unstable_physics")),
         "unstable_physics and the fault None",
     ),
-    "a reason without a fault": (failures(lambda record: record.update(fault="it broke")), "the fault it broke"),
     "lost and solved": (successes(lambda record: record.update(lost=True)), "was lost or broken off"),
     "never asked whether it was lost": (every(lambda record: record.pop("lost", None)), "has lost=None"),
     "a goal that did not end it": (successes(lambda record: record.update(steps=1100)), "the goal ends a rollout"),
-    "a goal that was no success": (
-        successes(lambda record: record.update(success=False, failure="execution_failure", steps=1200)),
-        "the goal ends a rollout",
-    ),
-    "failures as successes": (failures(lambda record: record.update(success=True, failure=None)), "success"),
     # prompts
     "no prompt": (every(lambda record: record.update(prompt_steps=0)), "begins after 0 steps"),
-    "a prompt that was not shown": (
-        every(lambda record: record.update(prompt_shown=None)),
-        "has prompt_shown=None",
-    ),
     "a prompt of a task without": (
         every(lambda record: record.update(prompt_shown=get_task(record["task"]).prompt is None or None)),
         "prompt_shown",
     ),
     # scenes
-    "scenes of zeros": (every(lambda record: record.update(scene_hash="0" * 16)), "equal for equal seeds only"),
     "no scenes": (every(lambda record: record.pop("scene_hash")), "hashes of 16 digits"),
     "other scenes in a control": (
         lambda folder: one(lambda record: record.update(scene_hash="ab" * 8))(folder / "pauses"),
@@ -189,19 +172,8 @@ STRICT: dict[str, tuple[Change, str]] = {
         r"has \{'paused_steps': 1000000\}, expected",
     ),
     # who acted, on what
-    "a policy of objects as pixels": (features({"observation.environment_state": "ENV"}), "inputs are 'pixels'"),
     "both read, pixels named": (
         both(
-            inputs("pixels", obs_type="both"),
-            features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
-        ),
-        "inputs are 'pixels'",
-    ),
-    "both read by a policy of one's own": (
-        both(
-            in_card(
-                lambda card: (card["policy"].update(type="window"), card["policy"]["settings"].pop("perception", 0))
-            ),
             inputs("pixels", obs_type="both"),
             features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
         ),
@@ -215,22 +187,10 @@ STRICT: dict[str, tuple[Change, str]] = {
         in_card(lambda card: card["settings"].update(env={"expert_action": True})),
         "inputs are 'pixels'",
     ),
-    "features without a form": (
-        both(
-            in_card(lambda card: card["policy"]["settings"].update(input_features=[7])),
-            inputs("pixels", obs_type="environment_state_agent_pos"),
-        ),
-        "inputs are 'pixels'",
-    ),
     "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
-    "settings without a form": (in_card(lambda card: card["settings"].update(env="expert_action")), "settings.env"),
     "versions of other years": (
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
         "the card names lerobot 0.1.0",
-    ),
-    "a version without a form": (
-        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "mujoco": "not 3"})),
-        "the card names mujoco not 3",
     ),
     # seeds
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
@@ -238,16 +198,10 @@ STRICT: dict[str, tuple[Change, str]] = {
         both(sealed, protocol(salt=None)),
         "expected a salt with the sealed",
     ),
-    "a salt that draws other variants": (
-        both(sealed, protocol(salt="6" * 32)),
-        "drew the variants",
-    ),
-    "sealed as by an earlier version": (both(relabelled, every(drawn(None))), "expected a salt with the sealed"),
     "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
     # statements
     "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),
     "look-alike letters": (stating("model", "mеmobench"), "one alphabet"),
-    "wide letters": (stating("model", "ｍｅｍｏ"), "one alphabet"),
     "a call of many people": (stating("submitter", "@team @all"), "submitter = "),
     "a date to come": (stating("date", "9999-12-31"), "date = "),
     "a look-alike host": (stating("links", {"code": "https://www.xn--ggle-55da.com/"}), "begins with https"),
@@ -266,7 +220,6 @@ def test_hostile_submission_is_refused(row: Path, tmp_path: Path, name: str) -> 
 
 PUBLISHED: dict[str, tuple[Change, str]] = {
     "prompts never played": (every(lambda record: record.update(prompt_steps=0, prompt_shown=None)), "begins after 0"),
-    "idling of a strict task": (every(lambda record: record.update(prompt_steps=300)), "begins after 300"),
     "failures as successes": (
         failures(lambda record: record.update(success=True, failure=None, steps=1000)),
         "without the checkpoint|the goal ends a rollout",

@@ -38,18 +38,6 @@ def test_a_log_file_shows_the_time_left_by_this_run_alone() -> None:
     assert others == ["5/10 episode 5", "episode 6: it slipped", "7/10 episode 7, 0:00:06 left"]
 
 
-def test_a_terminal_shows_a_bar_and_names_only_troubles() -> None:
-    written = io.StringIO()
-    screen = Console(file=written, width=100, force_terminal=True, highlight=False)
-    with counting(screen, "episodes", 2) as count:
-        count(1, 2, "a task, seed 1")
-        count(2, 2, "a task, seed 2", trouble="it slipped")
-    printed = written.getvalue()
-    assert "2/2" in printed
-    assert "a task, seed 2: it slipped" in printed
-    assert "seed 1" not in printed
-
-
 @pytest.fixture(scope="module")
 def tables() -> dict[str, RenderableType]:
     found = [get_task(name) for name in task_names()]

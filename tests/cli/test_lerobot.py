@@ -283,7 +283,6 @@ DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
         | {"policy.push_to_hub": False, "num_workers": 4, "log_freq": 200},
     ),
     (["policy=act", "steps=50"], {"log_freq": 5}),
-    (["policy=act", "policy.repo_id=user/name"], {"policy.push_to_hub": True}),
     (["policy=act", "dataset=mine"], {"dataset.repo_id": "local/mine", "dataset.root": "mine"}),
     (
         ["config_path=train.yaml", "align=semantic"],
@@ -291,7 +290,6 @@ DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
     ),
     # A memory that is not the checkpoint's has its own defaults.
     (SMALL, {"policy.memory_stride": 8}),
-    ([*SMALL, "policy.memory=frames"], {"policy.memory_stride": 8}),
     ([*SMALL, "policy.memory=motion", "policy.memory_stride=2"], {"policy.memory_stride": 2}),
     ([*SMALL, "align=none", "policy.memory=none"], {"policy.memory_phase": False}),
 ]
@@ -311,11 +309,9 @@ def test_a_training_gets_the_benchmarks_defaults(
         assert (config.memory_fusion, config.memory_settings) == (own.memory_fusion, own.memory_settings)
 
 
-def test_the_trainers_status_and_a_small_machine(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lerobot_memobench.training.command.cores", lambda: 2)
+def test_the_status_of_lerobots_trainer_is_returned(training: Called) -> None:
     training.action = lambda: 3
     assert main(["train", "policy=act"]) == 3
-    assert training.value("num_workers") == 2
 
 
 def test_settings_that_differ_from_the_checkpoints_are_noted(
@@ -341,18 +337,12 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
         (["policy=memobench_mem", "policy.memory=recurrent", "policy.memory_settings={length: 4}"], "'length'"),
         ([*SMALL, "align=none", "policy.memory=none", "policy.memory_phase=true"], "memory_phase=True"),
         (["policy=act", "dataset=stuff"], "meta/info.json"),
-        (["policy=act", "dataset=missing"], "memobench generate"),
-        (["policy=act", "device=cuda:99"], "cuda:99"),
         (["resume=true"], "output_dir="),
-        (["resume=true", "output_dir=nowhere"], "nowhere does not exist"),
         (["resume=true", "output_dir=empty"], "no complete checkpoint"),
         (["resume=true", "output_dir=run", "policy=act"], "policy=act"),
         (["resume=true", "output_dir=run", "config=train_paper"], "config=train_paper"),
-        (["resume=true", "output_dir=run", "--config_path=recipe.yaml"], "config_path=recipe.yaml"),
         (["resume=true", "output_dir=run", "align=semantic"], "align=none"),
         (["resume=true", "output_dir=run", "policy.optimizer_lr=1e-5"], "leave optimizer_lr out"),
-        (["resume=true", "output_dir=run", "--policy.ema_decay=0"], "ema_decay=0.999"),
-        (["resume=true", "output_dir=run", "optimizer.lr=0.5"], "optimizer.lr=0.001"),
         (["resume=true", "output_dir=run", "dataset=mine"], "dataset a/b"),
         (["resume=true", "output_dir=run", "episodes=[0, 1]"], "dataset.episodes=None"),
         (

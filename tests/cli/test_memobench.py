@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import errno
-import io
 import json
 import os
 import re
@@ -51,14 +49,11 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
         (["tasks", "--dir", "nowhere"], "is not a folder"),
         (["tasks", "--dir", "."], "found no"),
         (["report", "nowhere"], "is not a folder"),
-        (["report", "."], "no episode log"),
         (["report"], "Missing argument"),
         (["generate", "--tasks", "stov", "--out", "x"], "'stov'"),
         (["generate", "--episodes", "0", "--out", "x"], "episodes"),
         (["generate"], "--out"),
-        (["generate", "--referent", "rnd", "--out", "x"], "random"),
         (["cache", "nowhere"], "nowhere"),
-        (["cache", ".", "--size", "huge"], "tiny"),
         (["recipe", "train_papr"], "'train_paper'"),
         (["frobnicate"], "No such command"),
     ],
@@ -167,30 +162,6 @@ def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
     ]
     write_log(folder, records)
     return str(folder)
-
-
-def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
-    assert main(["report", f"p={a}", f"p={b}"]) == 0
-    out = capsys.readouterr().out
-    assert out.count("average of memory types") == 3, "of both, and joined"
-    assert "SR 75.0 at 20" in out
-    assert "75.0 [30.1–95.4]" in out
-    found = json.loads((tmp_path / "a" / "report.json").read_text())
-    assert set(found) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
-    assert main(["report", a, "--format", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["average"]["SR"] == found["average"]["SR"] == 50.0
-
-
-def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
-    assert main(["compare", a, b]) == 2
-    assert "replan_steps: 5 and 20" in capsys.readouterr().err
-    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["differences"][0]["difference"] == 25.0
-    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 0
-    first = next(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert (first["metric"], first["pairs"], first["difference"]) == ("SR", "4", "25.0")
 
 
 @pytest.mark.parametrize(("option", "number"), [("--out", errno.ENOSPC), ("--html", errno.EROFS)])

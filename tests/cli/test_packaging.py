@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
-
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, QUALITIES, Simulation
-from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ["requirements.lock", "scripts/uv-requirements.txt"]
@@ -65,35 +60,6 @@ def test_desktop_packages_are_not_locked() -> None:
     locked = pins("requirements.lock")
     assert "opencv-python-headless" in locked
     assert not {"opencv-python", "pynput", "evdev"} & set(locked)
-
-
-@pytest.mark.parametrize("script", ["scripts/setup", "scripts/lock", ".ci/run"])
-def test_scripts_parse_and_are_executable(script: str) -> None:
-    path = ROOT / script
-    assert path.stat().st_mode & 0o111
-    subprocess.run(["bash", "-n", path], check=True)
-
-
-def test_late_imports_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, library = tmp_path / "src", tmp_path / "library"
-    for folder in (source / "deep", library):
-        folder.mkdir(parents=True)
-    (source / "deep" / "a.py").write_text("def f():\n    import not_installed_here\n    from found_late import x\n")
-    (library / "found_late.py").write_text("x = 1\n")
-    script = load_script("compile_imports")
-    assert script.imported(source) == {"not_installed_here", "found_late"}
-    monkeypatch.setattr(script, "COMMANDS", ())
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.syspath_prepend(library)
-    script.compile_imports([source])
-    assert Path(importlib.util.cache_from_source(str(library / "found_late.py"))).is_file()
-
-
-def test_setup_renders_all_qualities(monkeypatch: pytest.MonkeyPatch) -> None:
-    rendered = []
-    monkeypatch.setattr(Simulation, "visible_bodies", lambda simulation, camera: rendered.append(camera))
-    load_script("compile_imports").render()
-    assert rendered == [*MJCF_CAMERAS] * len(QUALITIES)
 
 
 def executable(path: Path, text: str) -> None:

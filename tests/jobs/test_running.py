@@ -92,7 +92,6 @@ with locked(path, path):
     time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(MemobenchError, match=str(tmp_path)), locked(tmp_path, tmp_path):
             pass

@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench import io
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, choose_caches, private_folder
-from lerobot_memobench.jobs import start
 
 COMMAND = """
 import sys
@@ -47,17 +45,13 @@ def test_output_may_be_closed(tmp_path: Path) -> None:
 
 
 @linux
-@pytest.mark.parametrize("unbuffered", ["1", ""])
-@pytest.mark.parametrize("call", ["print('a' * 10**6, flush=True)", "say('a' * 10**6)", "print('a')"])
+@pytest.mark.parametrize(
+    ("call", "unbuffered"), [("print('a' * 10**6, flush=True)", "1"), ("say('a' * 10**6)", ""), ("print('a')", "")]
+)
 def test_a_reader_may_leave(call: str, unbuffered: str) -> None:
     line = '{ sleep 0.2; "$@"; echo "status $?" >&2; } | true'
     done = run_in_shell(line, call, PYTHONUNBUFFERED=unbuffered)
     assert done.stderr == "status 1\n"
-
-
-def test_other_broken_pipes_are_errors() -> None:
-    done = run_in_shell('"$@"', "(_ for _ in ()).throw(BrokenPipeError())")
-    assert "BrokenPipeError" in done.stderr
 
 
 SOCKET = """[
@@ -75,16 +69,6 @@ def test_sockets_fit_into_a_long_temporary_folder(tmp_path: Path) -> None:
         done = run_in_shell('"$@"', SOCKET, TMPDIR=str(long))
         assert (done.returncode, done.stderr) == (0, "")
     assert len(list(long.glob("tmp*"))) == 2  # temporary files stay where they were asked for
-
-
-@linux
-def test_a_long_temporary_folder_without_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 73)
-    monkeypatch.setattr(start, "SHORT_FOLDERS", (str(tmp_path / "none"),))
-    with pytest.raises(MemobenchError, match="set TMPDIR"):
-        start.prepare_process()
-    monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 71)
-    start.prepare_process()
 
 
 @linux

@@ -19,7 +19,6 @@ from lerobot_memobench.jobs.threads import (
     PROCESSES,
     cores,
     limit_torch,
-    sharing,
     torch_threads,
 )
 
@@ -85,16 +84,11 @@ def test_limits_of_outer_groups_count(machine: Machine, tmp_path: Path, monkeypa
     ("processors", "role", "large", "processes", "threads_of_torch"),
     [
         (2, ACTING, False, 1, 1),  # a small policy: one process, one core
-        (16, ACTING, False, 1, 1),
         (16, ACTING, False, 8, 1),  # parts of an evaluation
-        (2, ACTING, True, 1, 2),  # size=pi05: all cores
-        (16, ACTING, True, 1, 16),
         (16, ACTING, True, 4, 4),
         (2, ACTING, True, 4, 1),
         (2, LEARNING, False, 1, None),  # torch's own choice
-        (16, LEARNING, False, 1, None),
         (16, LEARNING, False, 4, 4),  # policies trained at once
-        (2, LEARNING, False, 2, 1),
     ],
 )
 def test_threads_of_each_role(
@@ -124,21 +118,6 @@ def test_variables_of_the_user_stay(machine: Machine, environment: dict[str, str
     before = torch.get_num_threads()
     limit_torch(2 * LARGE)
     assert torch.get_num_threads() == before
-
-
-def test_child_processes_decide_again(machine: Machine, environment: dict[str, str]) -> None:
-    machine.has(16)
-    threads.use_threads(ACTING)
-    known = {key: value for key, value in environment.items() if key.endswith(("_NUM_THREADS", "SPINCOUNT"))}
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS"), "1")
-    assert known == {**one, "GOMP_SPINCOUNT": "2000"}
-    threads.use_threads(LEARNING)
-    assert "OMP_NUM_THREADS" not in environment
-    assert "GOMP_SPINCOUNT" not in environment
-    environment.update(sharing(4, {}))
-    threads.use_threads(LEARNING)
-    assert environment["OMP_NUM_THREADS"] == "4"
-    assert environment["LP_NUM_THREADS"] == "1"
 
 
 def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
