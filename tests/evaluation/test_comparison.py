@@ -138,9 +138,7 @@ def test_differences_of_logs_are_refused_by_name_and_may_be_allowed(
     ("setting", "value"),
     [
         ("horizon", 600),
-        ("render", "high"),
         ("seed_base", 1007),
-        ("demonstration_prompt", False),
         ("prompt_in", "reset"),
     ],
 )
