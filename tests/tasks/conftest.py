@@ -85,11 +85,3 @@ def published() -> Path:
     if not folder.is_dir():
         pytest.skip("no published task folders next to the checkout")
     return folder
-
-
-@pytest.fixture
-def facts() -> Path:
-    """Return the folder of the reference facts and tools; skip without it."""
-    if not (SHARED / "spec" / "catalogue.json").is_file():
-        pytest.skip("no reference facts next to the checkout")
-    return SHARED

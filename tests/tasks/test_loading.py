@@ -258,10 +258,9 @@ def test_trees_of_tasks(write_task: Write, tmp_path: Path) -> None:
 # --- damaged files ---
 
 
-@pytest.mark.parametrize(("count", "seed"), [(200, 0), pytest.param(2000, 1, marks=pytest.mark.slow)])
-def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_task: Write) -> None:
-    rng, refused = random.Random(seed), 0
-    for _ in range(count):
+def test_damaged_files_load_or_raise_one_sentence(write_task: Write) -> None:
+    rng, refused = random.Random(0), 0
+    for _ in range(200):
         task = get_task(rng.choice(task_names()))
         folder = write_task(task.bddl_text, (task.folder / "task_config.meta.json").read_text())
         file = folder / rng.choice(["task_config.bddl", "task_config.meta.json"])
@@ -269,7 +268,7 @@ def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_t
         message = refusal(folder)
         refused += bool(message)
         assert not message or (str(folder) in message and "\n" not in message)
-    assert refused > count / 4
+    assert refused > 50
 
 
 def refusal(folder: Path) -> str:
