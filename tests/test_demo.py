@@ -70,7 +70,7 @@ def test_demo_writes_images_and_table(demo: SimpleNamespace, tmp_path: Path, mon
     monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(tmp_path)])
     demo.main()
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("expert", "memory", "contact_sheet.png", "memory.mp4", "memory.png", "memory.md"),
+        *("expert", "memory", "contact_sheet.png", "memory.mp4", "memory.png", "memory.md")
     }
     assert [Path(command[0]).name for command in commands] == ["lerobot"] * 4
     for command in commands:

@@ -81,6 +81,16 @@ def test_missing_or_broken_plugin_fails(monkeypatch: pytest.MonkeyPatch) -> None
     assert (finding.status, "make setup" in finding.fix) == ("failed", True)
 
 
+def test_a_copy_is_named_in_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "src" / doctor.PACKAGE / "inner").mkdir(parents=True)
+    for folder in (tmp_path, tmp_path / "src" / doctor.PACKAGE / "inner"):
+        monkeypatch.chdir(folder)
+        finding = doctor.plugin()
+        assert (finding.status, f"-e {tmp_path}" in finding.fix) == ("warning", True)
+    monkeypatch.chdir(Path(doctor.__file__).parent)
+    assert doctor.plugin().status == "ok"
+
+
 def test_operating_system(monkeypatch: pytest.MonkeyPatch) -> None:
     assert doctor.system().status in ("ok", "warning")
     with monkeypatch.context() as patched:

@@ -88,7 +88,7 @@ def test_tables_with_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (run,) = read_runs([logs.evaluation(tmp_path / "a")])
     changed = replace(run, protocol={**run.protocol, "horizon": 600, "suite": "strict"})
     assert example["departures"](changed)[len(example["departures"](run)) :] == [
-        *("suite strict, not published", "horizon 600, not 1200"),
+        *("suite strict, not published", "horizon 600, not 1200")
     ]
     report = example["paper_report"]([run])
     text = WRITERS["markdown"](report)

@@ -25,17 +25,7 @@ from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.report import HUB_FILE
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
-from tests.support.board import (
-    ABOUT,
-    TASKS,
-    VERSIONS,
-    evaluation,
-    first_failure,
-    in_card,
-    in_log,
-    sealed,
-    stating,
-)
+from tests.support.board import ABOUT, TASKS, VERSIONS, evaluation, first_failure, in_card, in_log, sealed, stating
 from tools.board import page
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_partners, check_submission, ranked, read_board
@@ -61,10 +51,7 @@ def board(evaluated: Path) -> Path:
 def with_controls(board: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A valid submission with a control, whose partner is the row of ``board``; do not change it."""
     place = tmp_path_factory.mktemp("controls")
-    folders = {
-        "": evaluation(place / "m", speed=60),
-        "pauses": evaluation(place / "p", pause_steps=100),
-    }
+    folders = {"": evaluation(place / "m", speed=60), "pauses": evaluation(place / "p", pause_steps=100)}
     about = About(**ABOUT | {"without_memory": "one", "links": {"code": "https://one.example/code"}})
     return write_submission(place / "board" / "two", about, folders)
 
@@ -354,14 +341,7 @@ def test_page_template_and_form_ask_for_the_same() -> None:
     assert all(name in text for name in (CARD, LOG, "pauses") for text in (template, form, page))
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Δ-ACT",
-        "清华 Robotics Lab",
-        "ロボット研究室",
-    ],
-)
+@pytest.mark.parametrize("name", ["Δ-ACT", "清华 Robotics Lab", "ロボット研究室"])
 def test_names_of_words_in_different_alphabets_are_accepted(name: str) -> None:
     assert About(model=name, submitter=name, training_data="none", date="2026-11-29").model == name
 

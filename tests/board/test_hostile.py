@@ -17,16 +17,7 @@ from lerobot_memobench.board.submission import CARD, LOG, About, write_submissio
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.board import (
-    ABOUT,
-    SALT,
-    evaluation,
-    in_card,
-    in_log,
-    scene_of,
-    sealed,
-    stating,
-)
+from tests.support.board import ABOUT, SALT, evaluation, in_card, in_log, scene_of, sealed, stating
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_author, check_paths, check_submission, read_board
 from tools.board.page import board_rows
@@ -40,10 +31,7 @@ Change = Callable[[Path], object]
 def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A valid row with a control; do not change it."""
     place = tmp_path_factory.mktemp("hostile")
-    folders = {
-        "": evaluation(place / "m"),
-        "pauses": evaluation(place / "p", pause_steps=100),
-    }
+    folders = {"": evaluation(place / "m"), "pauses": evaluation(place / "p", pause_steps=100)}
     return write_submission(place / "one", About(**ABOUT), folders)
 
 
@@ -194,10 +182,7 @@ STRICT: dict[str, tuple[Change, str]] = {
     ),
     # seeds
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
-    "sealed without a salt": (
-        both(sealed, protocol(salt=None)),
-        "expected a salt with the sealed",
-    ),
+    "sealed without a salt": (both(sealed, protocol(salt=None)), "expected a salt with the sealed"),
     "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
     # statements
     "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),

@@ -68,16 +68,6 @@ def executable(path: Path, text: str) -> None:
     path.chmod(0o755)
 
 
-def without_ffmpeg(folder: Path) -> str:
-    """Return a PATH of one folder with all programs of the system except ffmpeg."""
-    (folder / "system").mkdir()
-    for place in ("/usr/sbin", "/sbin", "/usr/bin", "/bin", "/usr/local/bin"):
-        for program in Path(place).glob("*"):
-            if program.name != "ffmpeg" and not (folder / "system" / program.name).exists():
-                (folder / "system" / program.name).symlink_to(program)
-    return str(folder / "system")
-
-
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
     """Return a folder with the files of setup; installers are to be replaced: no download."""
@@ -107,28 +97,6 @@ def test_setup_removes_only_its_own_packages(checkout: Path) -> None:
     assert [call.split()[1] for call in packages] == ["install", "uninstall", "install"], "no `sync`: it removes others"
     assert packages[1].split()[-1] == "dropped-one"
     assert (tmp_path / ".venv/.memobench-lock").read_text() == lock
-
-
-@pytest.mark.parametrize("may", [True, False])
-def test_setup_lists_system_packages_first(checkout: Path, may: bool) -> None:
-    tmp_path = checkout
-    executable(tmp_path / ".uv/bin/uv", "echo uv >&2")
-    executable(tmp_path / ".venv/bin/python", "exit 0")
-    executable(tmp_path / "bin/id", f"echo {0 if may else 1000}")
-    executable(tmp_path / "bin/sudo", "exit 1")
-    executable(tmp_path / "bin/apt-get", 'echo "apt-get $*" >&2')
-    environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{without_ffmpeg(tmp_path)}"}
-    done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
-    printed = done.stderr.splitlines()
-    installed = [line.split()[-1] for line in printed if line.startswith("apt-get install")]
-    if not may:
-        assert not installed
-        assert "will be installed" not in done.stderr
-        assert "ask for: apt-get install" in done.stderr
-        return
-    assert printed[0].startswith("setup: these system packages"), "before uv, Python and everything else"
-    assert printed[0].split("as root: ")[1].split() == installed
-    assert installed == ["ffmpeg"]
 
 
 def test_no_file_names_a_package_registry() -> None:

@@ -26,7 +26,6 @@ from lerobot_memobench.jobs.processes import locked
 from tests.support import logs, synthetic_dataset
 from tests.support.fake_loop import STOVE
 from tests.support.fork_server import Fork, ForkServer
-from tests.support.kills import hashes
 from tests.support.object_dataset import make_object_dataset
 
 COMMANDS = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
@@ -211,8 +210,7 @@ def test_all_processes_end(tmp_path: Path) -> None:
 
 @linux
 @pytest.mark.parametrize(
-    ("script", "waiting", "children"),
-    [("train_in_ten_minutes", "lerobot", 2), ("demo", "lerobot", 1)],
+    ("script", "waiting", "children"), [("train_in_ten_minutes", "lerobot", 2), ("demo", "lerobot", 1)]
 )
 def test_children_of_examples_end(tmp_path: Path, script: str, waiting: str, children: int) -> None:
     for name in ("memobench", "lerobot"):
@@ -349,30 +347,7 @@ def test_outcomes_do_not_depend_on_batches_parts_and_kills(
     assert outcomes(tmp_path / "out") == outcomes(alone(suite))
 
 
-@linux
-@pytest.mark.slow
-def test_a_generation_with_images_and_workers_is_killed_and_continued(tmp_path: Path) -> None:
-    words = ["-m", COMMANDS["memobench"], "generate", "--tasks", STOVE, "--episodes", "3", "--workers", "2", "--out"]
-    began = time.monotonic()
-    subprocess.run([sys.executable, *words, str(tmp_path / "whole")], check=True, capture_output=True)
-    whole_s = time.monotonic() - began
-    for share in (0.5, 0.8, 0.95):
-        job = subprocess.Popen([sys.executable, *words, str(tmp_path / "killed")], start_new_session=True)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            job.wait(share * whole_s)
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(job.pid, signal.SIGKILL)
-        job.wait()
-    subprocess.run([sys.executable, *words, str(tmp_path / "killed")], check=True, capture_output=True)
-    assert hashes(tmp_path / "killed") == hashes(tmp_path / "whole")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        *(["eval", "env=memobench", "tasks=stov"]),
-    ],
-)
+@pytest.mark.parametrize("words", [["eval", "--help"], ["eval", "env=memobench", "tasks=stov"]])
 def test_mistyped_names_and_help_import_no_torch(words: list[str]) -> None:
     code = (
         f"import sys; from lerobot_memobench.cli.lerobot import main; main({words}); sys.exit('torch' in sys.modules)"

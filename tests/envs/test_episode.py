@@ -13,14 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lerobot_memobench.constants import (
-    EXECUTION,
-    HORIZON,
-    PAPER,
-    SEALED,
-    SPLITS,
-    VALIDATION,
-)
+from lerobot_memobench.constants import EXECUTION, HORIZON, PAPER, SEALED, SPLITS, VALIDATION
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
@@ -214,9 +207,7 @@ def test_unreachable_goals_end_strict_episodes_only() -> None:
 
 # --- failures ---
 
-QUICK = {
-    "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-}
+QUICK = {"put_the_tomato_into_the_top_drawer_of_the_cabinet"}
 ALL = [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in task_names(suite=None)]
 
 

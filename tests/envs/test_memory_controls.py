@@ -63,13 +63,7 @@ def assert_clock_never_goes_back(frames: list[dict[str, Any]]) -> None:
     assert steps == list(range(len(steps)))
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("swap", "reshow=true"),
-        pytest.param(("delete",), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("words", [("swap", "reshow=true"), pytest.param(("delete",), marks=pytest.mark.slow)])
 def test_the_shipped_policy_is_corrupted(words: tuple[str, ...], tmp_path: Path) -> None:
     how, *more = words
     settings = [f"tasks={HIGHLIGHT}", "referent=random", "episodes=2", "batch_size=2", "horizon=8", "device=cpu"]

@@ -15,11 +15,7 @@ from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.envs.observations import Observer, check_obs_type, obs_type_of, policy_inputs
 from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.baselines import (
-    MemobenchExpertConfig,
-    MemobenchRandomConfig,
-    UntrainedConfig,
-)
+from lerobot_memobench.policies.baselines import MemobenchExpertConfig, MemobenchRandomConfig, UntrainedConfig
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.remote import RemoteConfig
 from lerobot_memobench.sim.object_layout import SIZE

@@ -162,7 +162,7 @@ def test_overview(browser: Any, report: Path) -> None:
     assert [chip.split()[-1] for chip in chips] == ["67", "33"]
     links = browser.js("[...document.querySelectorAll('a.csv')].map((a) => [a.download, a.href])")
     assert [name for name, _ in links] == [
-        *("mine-memory-types.csv", "mine-failures.csv", "mine-tasks.csv", "mine-prefix.csv"),
+        *("mine-memory-types.csv", "mine-failures.csv", "mine-tasks.csv", "mine-prefix.csv")
     ]
     saved = unquote(dict(links)["mine-tasks.csv"].partition(",")[2])
     rates = {row["task"]: row for row in csv.DictReader(io.StringIO(saved))}
@@ -383,10 +383,7 @@ def test_the_page_cannot_reach_the_network(chrome: Any, report: Path) -> None:
 
 def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> None:
     own = {"memory_type": "libero_object", "suite": "libero_object", "convention": "libero"}
-    write_log(
-        tmp_path / "run",
-        [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")],
-    )
+    write_log(tmp_path / "run", [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")])
     write_html([tmp_path / "run"], tmp_path / "made")
     show(browser, tmp_path / "made" / "index.html")
     heads = browser.js("[...document.querySelectorAll('#overview table.rates')].map((it) => it.tHead.innerText)")

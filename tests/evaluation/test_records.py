@@ -9,10 +9,7 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
-from lerobot_memobench.envs.evaluation_file import (
-    EVALUATION_FILE,
-    write_evaluation,
-)
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.headline import headline

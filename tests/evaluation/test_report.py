@@ -25,16 +25,7 @@ from lerobot_memobench.evaluation.metrics import report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, success_by_gap
 from lerobot_memobench.evaluation.records import Run, read_runs
 from lerobot_memobench.evaluation.report import best_interval, evaluation_report, write_report
-from lerobot_memobench.evaluation.tables import (
-    WRITERS,
-    Name,
-    Report,
-    Section,
-    Table,
-    csv_tables,
-    csv_text,
-    to_markdown,
-)
+from lerobot_memobench.evaluation.tables import WRITERS, Name, Report, Section, Table, csv_tables, csv_text, to_markdown
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
 from lerobot_memobench.tasks.gap import gaps, longest_gap

@@ -16,14 +16,7 @@ from lerobot_memobench.evaluation.statistics import detectable, holm, mcnemar, s
 
 @pytest.mark.parametrize(
     ("only_a", "only_b", "p"),
-    [
-        (0, 0, 1.0),
-        (0, 5, 2 / 32),
-        (0, 6, 2 / 64),
-        (6, 0, 2 / 64),
-        (2, 8, 2 * (1 + 10 + 45) / 1024),
-        (4, 4, 1.0),
-    ],
+    [(0, 0, 1.0), (0, 5, 2 / 32), (0, 6, 2 / 64), (6, 0, 2 / 64), (2, 8, 2 * (1 + 10 + 45) / 1024), (4, 4, 1.0)],
 )
 def test_mcnemar_is_the_two_sided_binomial_tail(only_a: int, only_b: int, p: float) -> None:
     assert mcnemar(only_a, only_b) == pytest.approx(p)

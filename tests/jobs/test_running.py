@@ -46,11 +46,7 @@ def test_killed_workers_are_reported(jobs: list[Note]) -> None:
 
 
 def test_one_run_at_a_time_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with (
-        locked(tmp_path, tmp_path),
-        pytest.raises(MemobenchError, match=str(tmp_path)),
-        locked(tmp_path, tmp_path),
-    ):
+    with locked(tmp_path, tmp_path), pytest.raises(MemobenchError, match=str(tmp_path)), locked(tmp_path, tmp_path):
         pass
     with locked(tmp_path, tmp_path):  # it is free again
         assert list(tmp_path.iterdir()) == []

@@ -12,15 +12,7 @@ import pytest
 import torch
 
 from lerobot_memobench.jobs import threads
-from lerobot_memobench.jobs.threads import (
-    ACTING,
-    LARGE,
-    LEARNING,
-    PROCESSES,
-    cores,
-    limit_torch,
-    torch_threads,
-)
+from lerobot_memobench.jobs.threads import ACTING, LARGE, LEARNING, PROCESSES, cores, limit_torch, torch_threads
 
 
 class Machine:

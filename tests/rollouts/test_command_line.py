@@ -130,17 +130,6 @@ def test_recipes_go_by_name_and_files_by_path() -> None:
             recipe_file(name)
 
 
-def test_the_line_overrides_the_file_and_the_file_the_defaults() -> None:
-    Path("recipe.yaml").write_text("policy: {type: act, chunk_size: 30}\nsteps: 5\ndataset: {repo_id: a/b}")
-    asked = read_words("train", parse_words(["config_path=recipe.yaml", "steps=7", "policy.n_action_steps=2"]))
-    asked = asked.default("steps", 1).default("policy.chunk_size", 1).default("seed", 3)
-    found: Any = asked.build()
-    assert (found.steps, found.seed, found.policy.chunk_size, found.policy.n_action_steps) == (7, 3, 30, 2)
-    assert [asked.get(key) for key in ("steps", "policy.chunk_size", "batch_size", "x.y")] == ["7", 30, None, None]
-    other = read_words("train", parse_words(["config_path=recipe.yaml", "policy=diffusion"])).build()
-    assert other.policy.type == "diffusion", "settings of another policy are dropped"
-
-
 def test_settings_of_a_checkpoint_are_overridden() -> None:
     Path("act").mkdir()
     Path("act/config.json").write_text(json.dumps({"type": "act", "chunk_size": 30, "dim_model": 64}))

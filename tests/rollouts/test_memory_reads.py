@@ -138,17 +138,7 @@ def test_the_file_of_another_rollout_is_left_out(tmp_path: Path, changes: dict[s
     assert named in note
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"",
-        gzip.compress(b"{}")[:-4],
-    ],
-    ids=[
-        "empty",
-        "cut off",
-    ],
-)
+@pytest.mark.parametrize("content", [b"", gzip.compress(b"{}")[:-4]], ids=["empty", "cut off"])
 def test_a_damaged_file_is_left_out_with_a_note(tmp_path: Path, content: bytes) -> None:
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()

@@ -18,14 +18,7 @@ from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import (
-    EvaluationPlan,
-    Grid,
-    PlannedTask,
-    Shard,
-    make_plan,
-    plan_line,
-)
+from lerobot_memobench.rollouts.plan import EvaluationPlan, Grid, PlannedTask, Shard, make_plan, plan_line
 from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
@@ -155,8 +148,7 @@ FEATURES = {
 
 
 @pytest.mark.parametrize(
-    ("seen", "shown"),
-    [(("images",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "images"), "both")],
+    ("seen", "shown"), [(("images",), "pixels_agent_pos"), (("objects",), OBJECTS), (("objects", "images"), "both")]
 )
 def test_a_checkpoint_gets_the_inputs_it_was_trained_on(seen: tuple[str, ...], shown: str) -> None:
     features = {key: value for name in seen for key, value in FEATURES[name].items()}

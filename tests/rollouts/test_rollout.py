@@ -162,8 +162,7 @@ class Watched:
 
 
 @pytest.mark.parametrize(
-    ("settings", "at"),
-    [({}, PROMPT), ({"reshow": True}, PROMPT), ({"corrupt_step": 3}, PROMPT + 3)],
+    ("settings", "at"), [({}, PROMPT), ({"reshow": True}, PROMPT), ({"corrupt_step": 3}, PROMPT + 3)]
 )
 def test_memory_is_corrupted_before_the_frame_is_observed(settings: dict[str, Any], at: int, tmp_path: Path) -> None:
     asked = {"corrupt": "swap", "tasks": HIGHLIGHT, "horizon": HORIZON, "obs_type": OBJECTS}

@@ -17,9 +17,7 @@ from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim import files, mjcf
-from lerobot_memobench.sim.robot import SUBSTEPS
-from lerobot_memobench.sim.scene import get_scene, scene_spec
-from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.visuals import drawing_model
 from lerobot_memobench.tasks.catalogue import get_task, load_task
 from tests.sim.conftest import DRAWER
@@ -45,24 +43,6 @@ def test_each_class_has_one_contact_box_of_its_size(name: str, monkeypatch: pyte
 def test_strict_tasks_ignore_scans(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv(files.SCANS_VARIABLE, str(tmp_path))
     assert not mjcf.class_file("artichoke", "strict").stand_in
-
-
-def test_visual_geoms_change_no_motion() -> None:
-    """The simulated model has none."""
-    sim = Simulation(get_task(DRAWER))
-    sim.reset(7)
-    ends = []
-    for visuals in (False, True):
-        model = scene_spec(sim.task, visuals).compile()
-        model.body_pos[:], model.body_quat[:] = sim.model.body_pos, sim.model.body_quat
-        data, rng = mujoco.MjData(model), np.random.default_rng(0)
-        data.qpos[:] = sim.data.qpos
-        for _ in range(50):
-            data.ctrl[:] = rng.uniform(*model.actuator_ctrlrange.T) / 4
-            mujoco.mj_step(model, data, SUBSTEPS)
-        ends.append(np.concatenate([data.qpos, data.qvel]))
-    assert np.abs(ends[0][: sim.model.nq] - sim.data.qpos).max() > 0.1
-    np.testing.assert_array_equal(*ends)
 
 
 # --- LIBERO's files and scans ---

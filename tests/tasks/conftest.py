@@ -45,10 +45,7 @@ METADATA: dict[str, Any] = {
     "key_frame": [-1, -1],
     "memory": [["a", "b", "c"], ["d", "e", "f"]],
     "operating_type": [[0, 0, 0], [1, 2, 1]],
-    "subtask_goals": [
-        {"and": [["wasopen", "box_1_top_region"]]},
-        {"and": [["in", "cup_1", "box_1_top_region"]]},
-    ],
+    "subtask_goals": [{"and": [["wasopen", "box_1_top_region"]]}, {"and": [["in", "cup_1", "box_1_top_region"]]}],
 }
 
 
