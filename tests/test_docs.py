@@ -169,17 +169,6 @@ def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
     assert recompute.problems_of_claims() == []
 
 
-def test_kept_evaluations_are_named_in_pages() -> None:
-    """Those of a comparison with stock LIBERO on the page of the scenes."""
-    there = set(pq.read_table(recompute.EVALUATIONS / "evaluations.parquet")["evaluation"].to_pylist())
-    named = {
-        name
-        for page in (recompute.PAGES[1], recompute.RESULTS / "scenes.md")
-        for name in re.findall(r"\[`(\w+)`\]\(\S*evaluations/rollouts.parquet\)", page.read_text())
-    }
-    assert named == there
-
-
 def test_tables_of_results_are_small() -> None:
     assert sum(file.stat().st_size for file in recompute.RESULTS.glob("**/*.parquet")) < 2_000_000
 
@@ -215,18 +204,6 @@ def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
     """Keep a log under the name ``one`` in the folder's tables."""
     write_log(folder / "logs" / "one", lines)
     kept.keep(folder / "logs", ["one"], folder)
-
-
-def test_a_claim_that_went_or_that_nobody_listed_is_found(tmp_path: Path) -> None:
-    page, claims = tmp_path / "page.md", tmp_path / "claims.md"
-    (tmp_path / "note.md").write_text("It solved | 50 | of\n50.\n")
-    page.write_text("With a memory 99\n[95–100].\n")
-    head = "| page | it says | source | the source says | kept |\n|---|---|---|---|---|\n"
-    claims.write_text(f"{head}| [page](page.md) | memory 99 [95–100] | [note](note.md) | 50 of 50 | no |\n")
-    assert recompute.problems_of_claims(claims) == recompute.problems_of_prose(page, claims) == []
-    claims.write_text(f"{head}| [page](page.md) | memory 98 | [note](note.md) | 49 of 50 | no |\n")
-    assert [problem.split(" does")[0] for problem in recompute.problems_of_claims(claims)] == ["page.md", "note.md"]
-    assert len(recompute.problems_of_prose(page, claims)) == 1
 
 
 # --- commands ---
@@ -420,20 +397,6 @@ def test_all_fields_of_log_and_card_have_a_meaning() -> None:
     rows = reference.typed_rows(episode_log.EpisodeRecord)
     required = [name.strip("`") for name, _, kind in rows if kind.endswith("required")]
     assert required == ["task", "memory_type", "episode", "success", "checkpoints"]
-
-
-def test_task_pages_have_a_card_per_task() -> None:
-    from lerobot_memobench.tasks.catalogue import task_names
-
-    for suite in ("published", "strict"):
-        index = reference.tasks_page(suite)
-        for memory_type in ("temporal", "spatial", "object", "procedural"):
-            page = f"tasks_{suite}_{memory_type}.md"
-            cards = reference.PAGES[f"benchmark/{page}"]()
-            names = task_names(memory_type, suite)
-            assert all(f"\n`{name}`\n" in cards for name in names)
-            assert all(f"({page}#{reference.slug(name)})" in index for name in names)
-            assert cards.count("needs a memory") >= len(names)
 
 
 @pytest.mark.parametrize("number", [1, 6, 20, 30])

@@ -180,6 +180,10 @@ STRICT: dict[str, tuple[Change, str]] = {
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
         "the card names lerobot 0.1.0",
     ),
+    "a version without a form": (
+        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "mujoco": "not 3"})),
+        "the card names mujoco not 3",
+    ),
     # seeds
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
     "sealed without a salt": (both(sealed, protocol(salt=None)), "expected a salt with the sealed"),

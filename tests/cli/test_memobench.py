@@ -48,11 +48,9 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["tasks", "--dir", "nowhere"], "is not a folder"),
         (["tasks", "--dir", "."], "found no"),
-        (["report", "nowhere"], "is not a folder"),
         (["report"], "Missing argument"),
         (["generate", "--tasks", "stov", "--out", "x"], "'stov'"),
         (["generate", "--episodes", "0", "--out", "x"], "episodes"),
-        (["generate"], "--out"),
         (["cache", "nowhere"], "nowhere"),
         (["recipe", "train_papr"], "'train_paper'"),
         (["frobnicate"], "No such command"),

@@ -92,14 +92,6 @@ def play(env: Any, seed: int, steps: int = 3) -> list[dict[str, Any]]:
     return found
 
 
-@pytest.fixture
-def no_rendering(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise AssertionError("something is rendered")
-
-    monkeypatch.setattr("lerobot_memobench.sim.simulation.get_rasterizer", refuse)
-
-
 # --- the contract ---
 
 CONTRACT = {
@@ -211,7 +203,6 @@ def test_batches_in_processes_of_all_tasks(name: str, tmp_path: Path) -> None:
 # --- prompt ---
 
 
-@pytest.mark.usefixtures("no_rendering")
 def test_prompt_ignores_actions_and_restores_the_scene() -> None:
     runs = []
     for seed in (1, 2):

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lerobot_memobench.constants import EXECUTION, HORIZON, PAPER, SEALED, SPLITS, VALIDATION
+from lerobot_memobench.constants import HORIZON, PAPER, SEALED, SPLITS, VALIDATION
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
@@ -26,7 +26,6 @@ from lerobot_memobench.tasks.task import STRICT, Task
 STOVE = "turn_on_the_stove_and_turn_it_off"
 STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
-HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED = 20_000
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 Policy = Callable[[Episode], NDArray[np.floating[Any]]]
@@ -274,11 +273,3 @@ def test_upstream_ends_when_all_checkpoints_have_held() -> None:
     assert episode_record(upstream, 0, 0.1)["failure"] == "execution_failure"
     paper = run(drawer(OPENED, AT_START), seed=7, horizon=3)
     assert (paper.exec_steps, paper.checkpoints_satisfied) == (3, False)
-
-
-def test_upstream_shows_no_prompt() -> None:
-    episode = Episode(get_task(HIGHLIGHT), rules="upstream")
-    episode.reset(7)
-    assert episode.phase == EXECUTION
-    line = episode_record(episode, 0, 0.1)
-    assert line["prompt_steps"] == 0

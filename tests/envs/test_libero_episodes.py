@@ -65,11 +65,6 @@ def test_success_ends_an_episode(env: gymnasium.Env[Any, Any]) -> None:
     assert not {"lost", "held_steps"} & {*record}
 
 
-def test_object_slots_are_refused() -> None:
-    with pytest.raises(MemobenchError, match="object slots, requires obs_type=pixels_agent_pos"):
-        MemobenchEnv(STOVE, obs_type="both")
-
-
 def test_both_commands_and_vla_eval_run_the_same_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot_memobench.vla_eval import MEMOBench
 

@@ -21,7 +21,6 @@ from tests.support.logs import protocol_of
 STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 HIDDEN = "find_the_artichoke_hidden_in_one_of_the_drawers"
-STRICT_HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED, HORIZON = 20_000, 4
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
@@ -90,15 +89,6 @@ def test_the_prompt_is_shown_again_after_the_corruption(task: str) -> None:
     assert len(executed) == len(usual) >= HORIZON + 1, "a strict task is held"
     for one, other in zip(executed, usual, strict=True):
         assert_same_scene(one, other)
-
-
-@pytest.mark.parametrize(
-    ("task", "step"), [(HIGHLIGHT, 0), pytest.param(STRICT_HIGHLIGHT, 0, marks=pytest.mark.slow), (STOVE, 2)]
-)
-def test_memory_is_corrupted_once_at_the_named_step(task: str, step: int) -> None:
-    frames = played(task, corrupt="noise", corrupt_step=step)
-    first = next(number for number, frame in enumerate(frames) if frame["phase"] == EXECUTION)
-    assert [number - first for number, frame in enumerate(frames) if frame["corrupt"]] == [step]
 
 
 def test_other_episodes_are_observed_in_the_prompt_phase() -> None:

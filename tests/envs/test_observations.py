@@ -42,7 +42,6 @@ def memory(**settings: Any) -> MemobenchMemConfig:
         (config(ACTConfig, STATE, SLOTS), OBJECTS, POSES),
         (config(ACTConfig), BOTH, f"pixels, {POSES}"),  # before training: everything
         (config(PI05Config, STATE, IMAGE, SLOTS), BOTH, "pixels"),  # it ignores object slots
-        (memory(), PIXELS, "pixels"),
         (memory(perception="objects", detector="package"), PIXELS, "detections"),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
         (MemobenchRandomConfig(), PIXELS, "nothing"),
@@ -69,7 +68,6 @@ def declared(kind: str, *seen: FeatureType, **more: Any) -> Any:
         (None, None),
         (declared("pi05"), None),
         (declared("memobench_random", FeatureType.VISUAL, perception=UntrainedConfig.perception), None),
-        (declared("act", FeatureType.VISUAL), PIXELS),
         (declared("diffusion", FeatureType.ENV, FeatureType.VISUAL), BOTH),
         (declared("pi05", FeatureType.ENV, FeatureType.VISUAL), PIXELS),
         (declared("mine", FeatureType.ENV), OBJECTS),

@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench import io
+from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, choose_caches, private_folder
+from lerobot_memobench.jobs import start
 
 COMMAND = """
 import sys
@@ -69,6 +71,16 @@ def test_sockets_fit_into_a_long_temporary_folder(tmp_path: Path) -> None:
         done = run_in_shell('"$@"', SOCKET, TMPDIR=str(long))
         assert (done.returncode, done.stderr) == (0, "")
     assert len(list(long.glob("tmp*"))) == 2  # temporary files stay where they were asked for
+
+
+@linux
+def test_a_long_temporary_folder_without_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 73)
+    monkeypatch.setattr(start, "SHORT_FOLDERS", (str(tmp_path / "none"),))
+    with pytest.raises(MemobenchError, match="set TMPDIR"):
+        start.prepare_process()
+    monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 71)
+    start.prepare_process()
 
 
 @linux

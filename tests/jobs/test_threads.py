@@ -112,19 +112,6 @@ def test_variables_of_the_user_stay(machine: Machine, environment: dict[str, str
     assert torch.get_num_threads() == before
 
 
-def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
-    machine.has(16)
-    threads.use_threads(ACTING)
-    before = torch.get_num_threads()
-    try:
-        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
-            environment[PROCESSES] = str(processes)
-            limit_torch(parameters)
-            assert torch.get_num_threads() == found
-    finally:
-        torch.set_num_threads(before)
-
-
 COMMAND = """
 from lerobot_memobench.cli.memobench import main
 main(["tasks", "--help"])
@@ -143,6 +130,19 @@ def ask():
     import torch, os
     return torch.get_num_threads(), os.environ["LP_NUM_THREADS"], os.environ["MEMOBENCH_WORKER"]
 """
+
+
+def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
+    machine.has(16)
+    threads.use_threads(ACTING)
+    before = torch.get_num_threads()
+    try:
+        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
+            environment[PROCESSES] = str(processes)
+            limit_torch(parameters)
+            assert torch.get_num_threads() == found
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("program", [COMMAND, WORKER], ids=["command", "worker"])

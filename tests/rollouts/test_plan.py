@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,12 @@ from hypothesis import strategies as st
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.constants import SPLITS
+from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import EvaluationPlan, Grid, PlannedTask, Shard, make_plan, plan_line
-from lerobot_memobench.rollouts.settings import card_settings
+from lerobot_memobench.rollouts.plan import EvaluationPlan, Grid, PlannedTask, Shard, plan_line
+from lerobot_memobench.rollouts.rerun import plan_of_evaluation, read_repeatable
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
 
@@ -81,6 +81,8 @@ PLANNED: list[tuple[list[str], dict[str, Any]]] = [
     ([*SMALL, "batch_size=3"], {"batch": 3, "use_async_envs": None}),
     (["episodes=50", "--eval.batch_size=0"], {"batch": 10}),
     (["shard=1/2", "output_dir=out", *SMALL], {"batch": 1}),
+    (["policy=memobench_remote", "host=127.0.0.1", "policy.label=a (é)"], {"policy": "memobench_remote"}),
+    (["policy=diffusion", "policy.down_dims=[16,32,64]", "policy.do_mask_loss_for_padding=true"], {"batch": 4}),
 ]
 
 
@@ -91,16 +93,17 @@ def test_settings_are_typed_and_completed(
     monkeypatch.setattr("lerobot_memobench.rollouts.plan.cores", lambda: 16)
     plan = plan_line([*BARE, *words])
     assert {name: facts(plan)[name] for name in found} == found
-    # The settings on a card make the same plan again.
-    asked = replace(card_settings(card_of(plan)), output_dir="out")
-    if "path" in asked.policy:
-        asked = replace(asked, policy={**asked.policy, "path": str(plan.policy_path)})
-    assert facts(make_plan(asked, plan.options, ())) == facts(plan)
+    # The card of the plan makes it again.
+    write_evaluation(Path("card"), card_of(plan))
+    again = plan_of_evaluation(*read_repeatable(Path("card")), Path("out"))
+    assert (facts(again), again.grid, again.options.shard) == (facts(plan), plan.grid, plan.options.shard)
 
 
 BAD: list[tuple[list[str], str]] = [
     (["episodes=many"], "a whole number"),
     (["episodes=0"], "episodes=0"),
+    (["batch_size=-1"], "batch_size=-1"),
+    (["policy=diffusion", "policy.down_dims=[1"], "policy.down_dims=[1 cannot be read"),
     (["resume=true"], "output_dir="),
     (["env.fps=30"], "fps"),
     (["env.render_every=5"], "render_every"),

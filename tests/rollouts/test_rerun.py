@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 import lerobot_memobench.registration  # noqa: F401
@@ -24,15 +22,8 @@ from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.weights import SHIPPED
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
-from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import plan_line
-from lerobot_memobench.rollouts.rerun import (
-    allowed_settings,
-    check_policy,
-    differences_here,
-    plan_of_evaluation,
-    read_repeatable,
-)
+from lerobot_memobench.rollouts.rerun import allowed_settings, check_policy, differences_here, read_repeatable
 from lerobot_memobench.rollouts.settings import EvaluationSettings, card_settings
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
@@ -81,6 +72,8 @@ HOSTILE: list[tuple[str, dict[str, Any]]] = [
     ("policy.seed", policy("memobench_random", seed="!!python/object/apply:os.system [x]")),
     ("policy.discover_packages_path", policy("act", discover_packages_path="antigravity")),
     ("policy.trust_remote_code", policy("memobench_random", trust_remote_code="true")),
+    ("policy.push_to_hub", policy("memobench_random", push_to_hub="true")),
+    ("policy.seed", policy("memobench_random", seed=True)),
     ("policy.repo_id", policy("act", repo_id="stranger/policy")),
     ("policy.base_weights", policy("memobench_mem", base_weights="stranger/weights")),
     ("policy.vision_backbone", policy("act", vision_backbone="resnet18")),
@@ -222,51 +215,6 @@ def test_every_episode_of_a_log_is_compared(fake_loop: FakeLoop, change: str, ca
     assert main(["rerun", "kept/evaluation.json", "--out", "again"]) == status
     assert "\nrepeated: " not in capsys.readouterr().out
     assert Path("again").exists() == (status == 1), "an incomplete evaluation is not run"
-
-
-BOOLEAN = st.sampled_from(["true", "false"])
-COUNT = st.integers(1, 300).map(str)
-OF_THE_RUN = {
-    "tasks": st.sampled_from(["all", "object,spatial", STOVE, f"{STOVE},{DRAWER}"]),
-    "episodes": COUNT,
-    "batch_size": COUNT,
-    "seed": st.integers(0, 99).map(str),
-    "referent": st.sampled_from(["fixed", "random"]),
-    "prompt_in": st.sampled_from(["auto", "steps", "reset"]),
-    "horizon": COUNT,
-    "obs_type": st.sampled_from(["pixels_agent_pos", "both"]),
-    "env.render": st.sampled_from(["default", "high"]),
-    "pause_steps": COUNT,
-    "speed": st.sampled_from(["1", "0.5", "0.33"]),
-    "eval.use_async_envs": BOOLEAN,
-    "rename_map": st.just('{"observation.images.image": "observation.images.top"}'),
-    "shard": st.sampled_from(["1/1", "2/3"]),
-}
-OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
-    "memobench_random": {"policy.seed": COUNT, "policy.smoothing": st.sampled_from(["0", "0.5", "1e-3"])},
-    "checkpoint": {"policy.smoothing": st.just("0.25"), "policy.device": st.just("cpu")},
-    "act": {"policy.chunk_size": st.just("100"), "policy.pretrained_backbone_weights": st.just("null")},
-    "diffusion": {"policy.down_dims": st.just("[16,32,64]"), "policy.do_mask_loss_for_padding": BOOLEAN},
-}
-
-
-@st.composite
-def command_lines(draw: st.DrawFn) -> list[str]:
-    policy = draw(st.sampled_from(list(OF_A_POLICY)))
-    known = OF_THE_RUN | OF_A_POLICY[policy]
-    keys = draw(st.lists(st.sampled_from(list(known)), unique=True))
-    return ["env=memobench", f"policy={policy}", *(f"{key}={draw(known[key])}" for key in keys)]
-
-
-@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
-@given(command_lines())
-def test_a_card_makes_its_plan_again(line: list[str]) -> None:
-    plan = plan_line([*line, "output_dir=out"])
-    write_evaluation(Path(), card_of(plan))
-    again = plan_of_evaluation(*read_repeatable(Path()), Path("out"))
-    assert again.settings.portable == plan.settings.portable
-    assert (again.options, again.policy, again.environment) == (plan.options, plan.policy, plan.environment)
-    assert (again.seed, again.batch, again.grid) == (plan.seed, plan.batch, plan.grid)
 
 
 # --- rows of the board ---

@@ -79,15 +79,6 @@ def test_highlights_are_drawn_and_go_away(simulate: Simulate) -> None:
         sim.render()
 
 
-def test_invalid_settings_are_errors(simulate: Simulate) -> None:
-    with pytest.raises(MemobenchError, match=r"'agentwiev'.*'agentview'"):
-        simulate().render("agentwiev")
-    with pytest.raises(MemobenchError, match=r"'hihg'.*'high'"):
-        RenderSettings(quality="hihg")
-    with pytest.raises(MemobenchError, match="0×256"):
-        RenderSettings(height=0)
-
-
 # --- caches ---
 
 SCENES = {
