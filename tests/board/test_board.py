@@ -71,6 +71,10 @@ def test_board_of_the_repository_is_valid() -> None:
 # --- doctored submissions ---
 
 
+def protocol(**settings: Any) -> Callable[[Path], None]:
+    return in_card(lambda card: card["protocol"].update(settings))
+
+
 def to_success(records: list[Json]) -> None:
     record = first_failure(records)
     record.update(success=True, failure=None)
@@ -99,10 +103,10 @@ def other_variant(records: list[Json]) -> None:
 DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
     "success with a failure class": (in_log(lambda log: first_failure(log).update(success=True)), "failure"),
     "checkpoint after the end": (in_log(lambda log: log[1].update(steps=10)), "checkpoints within them"),
-    "unknown observations": (in_card(lambda card: card["protocol"].update(obs_type="eyes")), "obs_type is 'eyes'"),
+    "unknown observations": (protocol(obs_type="eyes"), "obs_type is 'eyes'"),
     "settings in the log": (in_log(lambda log: log[0].update(replan_steps=1)), "replan_steps"),
     "pauses in the log only": (in_log(lambda log: log[0].update(paused_steps=300)), "paused_steps: absent and 300"),
-    "other seeds": (in_card(lambda card: card["protocol"].update(seed_base=20_000)), "seed_base: 20000 and 7"),
+    "other seeds": (protocol(seed_base=20_000), "seed_base: 20000 and 7"),
     "shifted seed": (in_log(lambda log: log[3].update(seed=99)), "seed_base: 7 and "),
     "other variant": (in_log(other_variant), "drew the variants"),
     "missing episode": (in_log(lambda log: log.pop(5)), "episode 5, is missing"),
@@ -239,7 +243,7 @@ def test_partner_is_another_row_of_the_same_protocol(with_controls: Path, board:
     with pytest.raises(MemobenchError, match="'two', is no other row; known are 'one'"):
         check_partners([*others, read_submission(folder)])
     stating("without_memory", "one")(folder)
-    in_card(lambda card: card["protocol"].update(replan_steps=10))(folder)
+    protocol(replan_steps=10)(folder)
     with pytest.raises(MemobenchError, match="differ in replan_steps: 10 and 5"):
         check_partners([*others, read_submission(folder)])
 
@@ -247,7 +251,7 @@ def test_partner_is_another_row_of_the_same_protocol(with_controls: Path, board:
 def test_refusal_is_one_line(board: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A line of its own would be a command of GitHub's workflow, such as ``::add-mask::``."""
     both = shutil.copytree(board, tmp_path / "board")
-    in_card(lambda card: card["protocol"].update(render="\n::error::x"))(both / "one")
+    protocol(render="\n::error::x")(both / "one")
     assert check_board([str(both)]) == 1
     assert check_board([str(tmp_path / "nowhere")]) == 1
     first, second = capsys.readouterr().err.splitlines()
@@ -351,7 +355,7 @@ def test_names_of_words_in_different_alphabets_are_accepted(name: str) -> None:
 
 def test_entries_of_the_hub(tmp_path: Path) -> None:
     folder = evaluation(tmp_path / "one")
-    in_card(lambda card: card["protocol"].update(episodes=20))(folder)
+    protocol(episodes=20)(folder)
     assert main(["export", str(folder), "--dataset", "user/memobench", "--out", str(tmp_path)]) == 0
     entries = parse_eval_result_entries(yaml.safe_load((tmp_path / HUB_FILE).read_text()))
     assert [entry.task_id for entry in entries] == ["strict_sr", "strict_msr", "strict_mur", "strict_mcr"]

@@ -44,6 +44,10 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
+def put(**fields: Any) -> Callable[[Json], object]:
+    return lambda record: record.update(fields)
+
+
 def every(change: Callable[[Json], object]) -> Change:
     return in_log(lambda log: [change(record) for record in log])
 
@@ -67,18 +71,6 @@ def marked(record: Json, steps: list[int | None], ordered: list[int | None] | No
 
 def firsts(record: Json) -> list[Any]:
     return [mark["first_step"] for mark in record["checkpoints"]]
-
-
-def solved(record: Json, step: int) -> None:
-    record.update(success=True, failure=None, lost=False, steps=step)
-    marked(record, [step] * len(record["checkpoints"]))
-
-
-def inputs(words: str, **protocol: Any) -> Change:
-    def change(folder: Path) -> None:
-        in_card(lambda card: card["protocol"].update(inputs=words, **protocol))(folder)
-
-    return change
 
 
 def features(kinds: dict[str, str]) -> Change:
@@ -119,7 +111,7 @@ def relabelled(folder: Path) -> None:
 
 STRICT: dict[str, tuple[Change, str]] = {
     # steps that no execution can have
-    "longer than the horizon": (failures(lambda record: record.update(steps=1300)), "at most 1200"),
+    "longer than the horizon": (failures(put(steps=1300)), "at most 1200"),
     "order without checkpoints": (
         one(lambda record: marked(record, firsts(record), [None] * len(record["checkpoints"]))),
         "in order at None",
@@ -129,17 +121,14 @@ STRICT: dict[str, tuple[Change, str]] = {
         "in order at",
     ),
     # ends that no execution can have
-    "given up early": (failures(lambda record: record.update(steps=900, lost=False)), "ended after 900 of 1200"),
-    "cut off by a horizon": (failures(lambda record: record.update(failure="cut_off")), "the failure class cut_off"),
-    "a fault without a reason": (
-        failures(lambda record: record.update(failure="unstable_physics")),
-        "unstable_physics and the fault None",
-    ),
-    "lost and solved": (successes(lambda record: record.update(lost=True)), "was lost or broken off"),
+    "given up early": (failures(put(steps=900, lost=False)), "ended after 900 of 1200"),
+    "cut off by a horizon": (failures(put(failure="cut_off")), "the failure class cut_off"),
+    "a fault without a reason": (failures(put(failure="unstable_physics")), "unstable_physics and the fault None"),
+    "lost and solved": (successes(put(lost=True)), "was lost or broken off"),
     "never asked whether it was lost": (every(lambda record: record.pop("lost", None)), "has lost=None"),
-    "a goal that did not end it": (successes(lambda record: record.update(steps=1100)), "the goal ends a rollout"),
+    "a goal that did not end it": (successes(put(steps=1100)), "the goal ends a rollout"),
     # prompts
-    "no prompt": (every(lambda record: record.update(prompt_steps=0)), "begins after 0 steps"),
+    "no prompt": (every(put(prompt_steps=0)), "begins after 0 steps"),
     "a prompt of a task without": (
         every(lambda record: record.update(prompt_shown=get_task(record["task"]).prompt is None or None)),
         "prompt_shown",
@@ -147,22 +136,19 @@ STRICT: dict[str, tuple[Change, str]] = {
     # scenes
     "no scenes": (every(lambda record: record.pop("scene_hash")), "hashes of 16 digits"),
     "other scenes in a control": (
-        lambda folder: one(lambda record: record.update(scene_hash="ab" * 8))(folder / "pauses"),
+        lambda folder: one(put(scene_hash="ab" * 8))(folder / "pauses"),
         "equal for equal seeds only",
     ),
-    "a hash of a version to come": (
-        in_card(lambda card: card["protocol"].update(scene_hash_version=99)),
-        "scene_hash_version is 99",
-    ),
+    "a hash of a version to come": (protocol(scene_hash_version=99), "scene_hash_version is 99"),
     # pauses
     "more pauses than steps": (
-        lambda folder: one(lambda record: record.update(paused_steps=10**6))(folder / "pauses"),
+        lambda folder: one(put(paused_steps=10**6))(folder / "pauses"),
         r"has \{'paused_steps': 1000000\}, expected",
     ),
     # who acted, on what
     "both read, pixels named": (
         both(
-            inputs("pixels", obs_type="both"),
+            protocol(inputs="pixels", obs_type="both"),
             features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
         ),
         "inputs are 'pixels'",
@@ -208,12 +194,12 @@ def test_hostile_submission_is_refused(row: Path, tmp_path: Path, name: str) -> 
 
 
 PUBLISHED: dict[str, tuple[Change, str]] = {
-    "prompts never played": (every(lambda record: record.update(prompt_steps=0, prompt_shown=None)), "begins after 0"),
+    "prompts never played": (every(put(prompt_steps=0, prompt_shown=None)), "begins after 0"),
     "failures as successes": (
-        failures(lambda record: record.update(success=True, failure=None, steps=1000)),
+        failures(put(success=True, failure=None, steps=1000)),
         "without the checkpoint|the goal ends a rollout",
     ),
-    "lost goals": (failures(lambda record: record.update(lost=True)), "lost: absent and True"),
+    "lost goals": (failures(put(lost=True)), "lost: absent and True"),
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
 }
 
@@ -253,7 +239,7 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
         stating("model", "Other"),
         in_card(lambda card: card["checkpoint"].update(path="user/other")),
         lambda folder: in_card(lambda card: card["checkpoint"].update(path="user/other"))(folder / "pauses"),
-        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "pauses"),
+        lambda folder: one(put(wall_s=1.0))(folder / "pauses"),
         lambda folder: shutil.rmtree(folder / "pauses"),
     ],
     ids=["another model", "other weights", "a control's card", "a control's log", "a control less"],

@@ -74,9 +74,6 @@ def test_methods_are_names_policies_or_folders(tmp_path: Path) -> None:
     assert [run.name for run in sweeps(runs)["act aaaaaaaa"]] == ["a", "b"]
     with pytest.raises(MemobenchError, match="'x'"):
         read_runs([f"x={tmp_path}/a", f"x={tmp_path}/c"])
-    for name, k in (("d", 5), ("e", 5), ("f", 20)):
-        logs.evaluation(tmp_path / name, replan_steps=k)
-    assert [run.method for run in read_runs([tmp_path / name for name in "def"])] == ["d", "e", "f"]
     own = {"type": "act", "settings": {"n_action_steps": 35}}
     logs.evaluation(tmp_path / "own", replan_steps=None, policy=own)
     assert read_runs([tmp_path / "own"])[0].replan_steps == 35, "the policy's own interval, by its card"

@@ -12,7 +12,6 @@ from typing import Any
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts.card import policy_facts, run_facts, training_facts, with_checkpoint
 from tests.support import logs
@@ -31,17 +30,9 @@ def card(**changes: Any) -> dict[str, Any]:
 # --- facts ---
 
 
-def test_a_policy_is_known_by_settings_checkpoint_and_detector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_is_known_by_settings_and_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     facts = policy_facts({"type": "act", "chunk_size": 50, "device": "cuda", "pretrained_path": "/somewhere"}, 7)
     assert facts == {"type": "act", "seed": 7, "settings": {"chunk_size": 50}}
-    file = tmp_path / "detector.safetensors"
-    file.write_bytes(b"one")
-    settings = {"type": "memobench_mem", "perception": "objects", "detector": str(file)}
-    assert policy_facts(settings, 7)["detector_sha256"] == hashlib.sha256(b"one").hexdigest()
-    assert "detector_sha256" not in policy_facts({**settings, "detector": None, "visual_encoder": str(file)}, 7)
-    file.unlink()
-    with pytest.raises(MemobenchError, match="there is no file"):
-        policy_facts(settings, 7)
     # A repository is known once it has been fetched: the configuration first, the weights when the policy is made.
     snapshot = tmp_path / "models--user--name" / "snapshots" / "0123456789abcdef0123456789abcdef01234567"
     snapshot.mkdir(parents=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -152,25 +151,6 @@ def test_unusable_configurations_are_ignored(content: str, home: Path, monkeypat
     (home / ".libero").mkdir()
     (home / ".libero/config.yaml").write_text(content)
     assert files.check_assets() == folder
-
-
-def test_files_are_hashed_once_for_all_processes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = install("package", home, monkeypatch)
-    files.check_assets()
-    hashed, real = [], files.file_hash
-    monkeypatch.setattr(files, "file_hash", lambda path: hashed.append(path) or real(path))
-    for change, count in ((False, 0), (True, 2)):  # plate: the second of three files
-        if change:
-            before = os.stat(folder / PLATE)
-            (folder / PLATE).write_bytes(b"black")
-            os.utime(folder / PLATE, ns=(before.st_atime_ns, before.st_mtime_ns))
-        files._verified.cache_clear()  # as in a new process
-        if change:
-            with pytest.raises(MemobenchError, match="hash differs"):
-                files.check_assets()
-        else:
-            assert files.check_assets() == folder
-        assert len(hashed) == count
 
 
 # --- download and copy ---
