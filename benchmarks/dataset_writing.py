@@ -45,7 +45,7 @@ from lerobot_memobench.datasets.layout import (
 )
 from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.published_files import write_published
+from tests.support.libero_layout import write_published
 from tests.support.short_demonstrations import record_demonstration
 
 TASK = "turn_on_the_stove_and_turn_it_off"

@@ -28,7 +28,7 @@ from torch.nn.parallel import DistributedDataParallel
 
 from lerobot_memobench.policies.memobench_mem import losses
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.average import WeightAverage
+from lerobot_memobench.training.loop import WeightAverage
 
 WARM_UP, BATCH = 3, 16
 Part = Callable[[str, str, int], dict[str, Any]]

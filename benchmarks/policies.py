@@ -12,7 +12,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SIZES, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.average import WeightAverage
+from lerobot_memobench.training.loop import WeightAverage
 
 MEMORY_FRAMES = 32
 """Frames of a full memory, the default of memory=frames."""

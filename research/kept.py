@@ -31,11 +31,8 @@ Rows = list[dict[str, Any]]
 def keep(root: Path, names: Iterable[str], kept: Path) -> None:
     """Add evaluations and commands to the tables in ``kept``; earlier ones of the same names are replaced.
 
-    Args:
-        root: folder of the evaluations.
-        names: paths below it. ``root/name`` is an evaluation's folder, ``root/name.json`` describes its command; one
-            of them may be missing. A dataset's folder is not kept.
-        kept: folder of the tables; made where it is missing.
+    ``root/name`` is an evaluation's folder, ``root/name.json`` describes its command; one of them may be missing. A
+    dataset's folder is not kept.
     """
     rollouts: Rows = []
     evaluations: Rows = []
@@ -62,16 +59,7 @@ def keep(root: Path, names: Iterable[str], kept: Path) -> None:
 
 
 def restore(kept: Path, root: Path, names: Sequence[str] | None = None) -> list[str]:
-    """Write kept evaluations into ``root`` as the folders that they were; return their names.
-
-    Args:
-        kept: folder of the tables.
-        root: each evaluation becomes ``root/name``.
-        names: of the evaluations; None for all.
-
-    Raises:
-        MemobenchError: the tables hold no evaluation of a name.
-    """
+    """Write kept evaluations of these names, or all, as folders below ``root``; return their names."""
     if not (kept / EVALUATIONS).exists():
         raise MemobenchError(f"{kept} holds no {EVALUATIONS}; give a folder that --keep has written")
     evaluations = {row[NAME]: row for row in _read(kept / EVALUATIONS)}

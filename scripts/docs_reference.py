@@ -60,7 +60,8 @@ PUBLIC = {
     "Observations": ("envs.observations", "observation_space action_space policy_features policy_inputs reads_prompt"),
     "Episode log": ("envs.episode_log", "read_episodes EpisodeRecord CheckpointRecord"),
     "Metrics": ("evaluation.metrics", "Rate Summary summary_of report_values wilson"),
-    "Comparison": ("evaluation.comparison", "Comparison Contrast compare_evaluations"),
+    "Comparison": ("evaluation.comparison", "Comparison compare_evaluations"),
+    "Contrast": ("evaluation.statistics", "Contrast"),
     "Datasets": ("datasets.episodes", "episodes_where list_episodes read_episode RecordedEpisode"),
     "Memory mechanisms": ("policies.memobench_mem.memory.mechanism", "MemoryMechanism"),
     "Rendering without OpenGL": ("mujoco_raster", "Renderer RasterError not_drawn"),
@@ -343,7 +344,6 @@ def typed_rows(kind: Any) -> list[list[str]]:
 
 
 PROTOCOL_ONLY = {
-    "world": "`libero`; absent for the scenes of version 0.2, a list for a log of both",
     "hold": "mean of the drawn holds of a strict task, control steps",
     "goals": "revision of the goals of strict tasks",
     "scene_hash_version": "version of `scene_hash`; hashes of different versions are not compared",
@@ -353,16 +353,22 @@ PROTOCOL_ONLY = {
 
 
 def meanings(kind: Any) -> dict[str, str]:
-    """Return field -> meaning from the docstrings of a `TypedDict` and its bases."""
+    """Return field -> meaning from the comments of a `TypedDict`, above a field or behind it."""
     meaning: dict[str, str] = {}
-    for base in getattr(kind, "__orig_bases__", ()):
-        meaning |= meanings(base)
     if "horizon" in kind.__annotations__:
         from lerobot_memobench.envs.settings import EnvSettings
 
         meaning |= {field.name: field.metadata["meaning"] for field in dataclasses.fields(EnvSettings)}
         meaning |= PROTOCOL_ONLY
-    return meaning | arguments(inspect.getdoc(kind) or "")
+    above: list[str] = []
+    for line in inspect.getsource(kind).splitlines():
+        if comment := re.fullmatch(r" {4}# (.*)", line):
+            above.append(comment[1])
+        elif field := re.fullmatch(r" {4}(\w+): [^#]*(?:  # (.*))?", line):
+            if text := plain(" ".join([*above, field[2] or ""])):
+                meaning[field[1]] = text
+            above = []
+    return meaning
 
 
 def type_name(hint: Any) -> str:
@@ -461,7 +467,7 @@ def solved_by_routine() -> dict[str, float]:
 
 def without_memory(task: Any) -> dict[str, str]:
     """Return referent -> rate without a memory: routine or chance of a published task, ceiling of a strict one."""
-    from lerobot_memobench.tasks.evidence import chance
+    from lerobot_memobench.tasks.assessment import chance
     from research.necessity.adversaries import ceiling
 
     if task.suite == "strict":
@@ -494,15 +500,14 @@ PROMPTS = {
 
 def tasks_page(suite: str) -> str:
     """Return the list of a suite's tasks, with links to their cards."""
-    from lerobot_memobench.tasks.catalogue import get_task, task_names
-    from lerobot_memobench.tasks.gap import longest_gap
+    from lerobot_memobench.tasks.catalogue import get_task, longest_cue_to_use, task_names
 
     rows = []
     for number, name in enumerate(task_names(suite=suite), 1):
         task = get_task(name)
         rates = " · ".join(without_memory(task).values())
         link = f"[{title_of(task)}]({card_page(task)}#{slug(name)})"
-        rows.append([str(number), link, task.memory_type, task.operations, str(longest_gap(task) or "–"), rates])
+        rows.append([str(number), link, task.memory_type, task.operations, str(longest_cue_to_use(task) or "–"), rates])
     return f"""# {suite.capitalize()} tasks
 
 `tasks=` accepts the numbers and names. *Operations* are those of the checkpoints: Storage, Update, Compression. The
@@ -544,8 +549,7 @@ def title_of(task: Any) -> str:
 def task_parts(number: int, task: Any) -> Iterator[str]:
     """Yield one task's card."""
     from lerobot_memobench.evaluation.tables import OPERATION_NAMES
-    from lerobot_memobench.tasks.catalogue import get_task, task_number
-    from lerobot_memobench.tasks.gap import gaps
+    from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, task_number
 
     drawn = task.suite == "strict"  # the seed draws the instruction
     yield f"## {number}. {title_of(task)} {{ #{slug(task.name)} }}"
@@ -560,7 +564,7 @@ def task_parts(number: int, task: Any) -> Iterator[str]:
         ["fixtures", ", ".join(sorted(set(task.fixtures.values()) - {"kitchen_table"})) or "table only"],
         ["admissible goals", str(len(task.random_variants))],
     ]
-    measured = " · ".join("–" if gap is None else str(gap) for gap in gaps(task))
+    measured = " · ".join("–" if distance is None else str(distance) for distance in cue_to_use(task))
     rows.append(["[gap](gap.md) of each checkpoint, control steps", measured])
     if task.derived_from:
         page = card_page(get_task(task.derived_from))
@@ -624,10 +628,7 @@ LINK = re.compile(r"\[([^\[\]]*(?:\[[^\[\]]*\][^\[\]]*)*)\]\(([^()\s]+)\)")
 
 
 def relink(markdown: str, source: str, page: str) -> str:
-    """Return Markdown of the repository's file ``source`` with its links adapted to the site's page ``page``.
-
-    Links to files outside the site become the path as code.
-    """
+    """Return Markdown of the file ``source`` as the site's page ``page``; links that leave the site become paths."""
     folder = posixpath.dirname(page) or "."
 
     def adapt(match: re.Match[str]) -> str:

@@ -118,7 +118,6 @@ def grid(cells: Sequence[tuple[str, Pixels]], columns: int, label: int = 12, hea
 
 
 def _wrapped(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: int) -> list[str]:
-    """Break a text between words into lines of at most ``width`` pixels."""
     lines: list[str] = []
     for word in text.split():
         if lines and font.getlength(f"{lines[-1]} {word}") <= width:

@@ -40,9 +40,9 @@ def cpu_seconds(operation: Callable[[], Any], count: int = 1) -> float:
 def here() -> Operations:
     """Return the operations of this package; the first constructs the simulation."""
     from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
-    from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_tasks
+    from lerobot_memobench.tasks.catalogue import get_task, initial_states, task_names
 
-    task = get_libero_task(libero_tasks(SUITE)[TASK_ID])
+    task = get_task(task_names(suite=SUITE)[TASK_ID])
     sims: list[Simulation] = []
 
     def first() -> None:

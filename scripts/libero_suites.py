@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from lerobot_memobench.tasks.libero_suites import FOLDER
+from lerobot_memobench.tasks.catalogue import LIBERO_FOLDER
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 ROOT = "libero/libero"
@@ -44,7 +44,7 @@ def main() -> None:
         for suite, names in task_map(wheel).items():
             if suite in LIBERO_SUITES:
                 entries = suite_entries(wheel, suite, names)
-                path = FOLDER / f"{suite}.zip"
+                path = LIBERO_FOLDER / f"{suite}.zip"
                 if not arguments.check:
                     path.parent.mkdir(exist_ok=True)
                     path.write_bytes(packed(entries))

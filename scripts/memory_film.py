@@ -53,11 +53,7 @@ class Frame:
 
 
 def frames_of(variant: int) -> tuple[list[Frame], list[Frame]]:
-    """Return the frames of the prompt without the rest after it, and of the execution without holds.
-
-    Raises:
-        SystemExit: the expert did not succeed.
-    """
+    """Return the frames of the prompt without the rest after it, and of the execution without holds."""
     episode = Episode(get_task(TASK), referent="random", render=RenderSettings(2 * SIDE, 2 * SIDE, "high"))
     episode.reset(SEED, variant)
     prompt, execution = [frame_of(episode)], list[Frame]()
@@ -101,11 +97,7 @@ def composed(columns: Sequence[Frame], headline: str, colour: tuple[int, int, in
 
 
 def animation() -> Iterator[tuple[Image.Image, float]]:
-    """Yield the frames of the animation and their durations in seconds; a finished episode repeats its last frame.
-
-    Raises:
-        SystemExit: the pictures at the first step of the execution differ.
-    """
+    """Yield the frames of the animation and their durations in seconds; a finished episode repeats its last frame."""
     prompts, executions = zip(*map(frames_of, VARIANTS), strict=True)
     step = STRIDE / CONTROL_HZ / SPEED
     for columns in _together(prompts):

@@ -116,7 +116,6 @@ def of_card(page: Path) -> Values:
 
 
 def _row(rollouts: int, cells: list[str]) -> Row:
-    """Return a task's rates from a card's cells, per cent."""
     return {
         metric: Rate(None, 0) if cell == "–" else Rate(float(cell) / 100, rollouts)
         for metric, cell in zip(METRICS, cells, strict=True)
@@ -218,7 +217,6 @@ def _claims(page: Path) -> list[list[str]]:
 
 
 def _place(page: Path, link: str) -> Path:
-    """Return the file that a cell of a page links."""
     found = re.search(r"\]\(([^)#]+)", link)
     if found is None:
         raise MemobenchError(f"{page}: {link!r} links no file")

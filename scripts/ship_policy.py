@@ -27,8 +27,14 @@ from lerobot_memobench.envs.episode_log import MERGED_FILE
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
-from lerobot_memobench.policies.checkpoint import SHIPPED, WEIGHTS_FILE, checkpoint_folder, shipped_policies
-from lerobot_memobench.policies.lerobot_config import ELSEWHERE, encoded_config
+from lerobot_memobench.policies.checkpoint import (
+    ELSEWHERE,
+    SHIPPED,
+    WEIGHTS_FILE,
+    checkpoint_folder,
+    encoded_config,
+    shipped_policies,
+)
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.rollouts.card import git, training_facts
 from lerobot_memobench.tasks.catalogue import get_task, task_names
@@ -109,10 +115,7 @@ def began_with(shipped: Path) -> str:
 
 
 def trainings(source: Path) -> list[dict[str, Any]]:
-    """Return the settings of the trainings that led to a checkpoint, one from the weights of the other.
-
-    A policy of the package has no record of its training; its name is returned instead.
-    """
+    """Return the settings of the trainings that led to a checkpoint; a policy of the package gives its name."""
     if not (source / TRAINED).is_file():
         policy = json.loads((source / "config.json").read_text())
         return [{"shipped": source.name, "folder": source, "policy": policy}]
@@ -123,11 +126,7 @@ def trainings(source: Path) -> list[dict[str, Any]]:
 
 
 def training(run: dict[str, Any], before: dict[str, Any] | None, named: bool) -> list[str]:
-    """Return the command of a training, from the weights of the training ``before`` if there is one.
-
-    Args:
-        named: whether the command names its folder, because there are several.
-    """
+    """Return the command of a training from the weights of ``before``; ``named``: there are several."""
     policy = run["policy"]
     if before is None:
         kind = f"policy=memobench_mem perception={policy['perception']} size={policy['size']}"

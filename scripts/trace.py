@@ -79,11 +79,7 @@ class Trace:
 
 
 def command(program: str, *words: object) -> None:
-    """Run ``lerobot`` or ``memobench``.
-
-    Raises:
-        RuntimeError: the command failed.
-    """
+    """Run ``lerobot`` or ``memobench``."""
     from lerobot_memobench.cli import lerobot, memobench
 
     if status := {"lerobot": lerobot, "memobench": memobench}[program].main(list(map(str, words))):

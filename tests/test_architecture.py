@@ -91,7 +91,7 @@ def renames(tree: ast.AST) -> Iterator[str]:
 def test_only_io_writes_files_atomically() -> None:
     """The other allowed modules move finished folders that no other process uses."""
     datasets = ("datasets.stage", "datasets.write")
-    movers = ("io", *datasets, "training.view")
+    movers = ("io", *datasets, "training.trainer")
     allowed = {f"{PACKAGE}.{name}" for name in movers}
     assert [(name, call) for name, tree in trees().items() for call in renames(tree) if name not in allowed] == []
 

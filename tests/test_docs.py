@@ -37,8 +37,7 @@ from lerobot_memobench.commands.command_line import (
 from lerobot_memobench.envs import episode_log, evaluation_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory import OURS
-from lerobot_memobench.rollouts.plan import take_run_options
-from lerobot_memobench.rollouts.settings import read_settings
+from lerobot_memobench.rollouts.plan import read_settings, take_run_options
 from lerobot_memobench.training.command import take_training_options
 from research import kept
 from tests.support.logs import rollout, write_log

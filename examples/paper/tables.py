@@ -15,11 +15,10 @@ from published import RAW, PublishedRow, published_rows
 from lerobot_memobench.constants import BY_PAPER, EVALUATION_SEED, HORIZON
 from lerobot_memobench.envs.settings import IMAGE_SETTINGS
 from lerobot_memobench.evaluation.comparison import NOTE
-from lerobot_memobench.evaluation.controls import oracle_share
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import METRICS, Rate
-from lerobot_memobench.evaluation.records import Run, read_runs
+from lerobot_memobench.evaluation.records import Run, headline, read_runs
 from lerobot_memobench.evaluation.report import LEADING, PAPER_COLUMNS, run_row, wide_columns
+from lerobot_memobench.evaluation.statistics import oracle_share
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, WRITERS, Cell, Report, Section, Table, percent_text
 from lerobot_memobench.tasks.task import MEMORY_TYPES, PUBLISHED
 

@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import SPLITS
-from lerobot_memobench.datasets.record import Perturbation
+from lerobot_memobench.datasets.generate import Perturbation
 from lerobot_memobench.envs.episode import Episode, generator
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import draft_of, write_file
-from lerobot_memobench.jobs.processes import Advance
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, run_jobs
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_index
 from lerobot_memobench.untrusted import read_json
@@ -44,11 +43,7 @@ KINDS_FILE = "kinds.json"
 
 
 class Pictures:
-    """Labelled images of several files as one, read from the disk as they are asked for.
-
-    Raises:
-        MemobenchError: a file holds no labelled images of this version.
-    """
+    """Labelled images of several files as one, read from the disk as they are asked for."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         self._files = [_read(file) for file in files]
@@ -78,12 +73,7 @@ def _read(file: Path) -> Rows:
 
 @dataclass(frozen=True)
 class DetectorData:
-    """Which images are made.
-
-    Attributes:
-        names: of tasks. first_seed: of the episodes. episodes: of each task. frames: of each episode, `PER_FRAME`
-            images each. workers: processes.
-    """
+    """Images to make: ``frames`` of each episode, `PER_FRAME` images each, by so many ``workers``."""
 
     names: Sequence[str]
     first_seed: int
@@ -92,11 +82,7 @@ class DetectorData:
     workers: int = 1
 
     def pictures(self, folder: Path, allowed: range, progress: Callable[[Advance], None] | None = None) -> Pictures:
-        """Make the images that a folder lacks, and return all of them.
-
-        Raises:
-            MemobenchError: a seed is not one of those allowed, or the folder was begun with other kinds.
-        """
+        """Make the images that a folder lacks, and return all of them."""
         seeds = range(self.first_seed, self.first_seed + self.episodes)
         if seeds[0] not in allowed or seeds[-1] not in allowed:
             raise MemobenchError(
@@ -120,11 +106,7 @@ class DetectorData:
 
 @dataclass(frozen=True)
 class EpisodeImages:
-    """The labelled images of one episode, a job.
-
-    Attributes:
-        name: of the task. seed: of the episode. folder: the file. frames: how many of the episode are taken.
-    """
+    """The labelled images of so many ``frames`` of one episode of the task ``name``, a job."""
 
     name: str
     seed: int
@@ -169,10 +151,7 @@ class ExpertState:
 
 
 def expert_states(episode: Episode, seed: int, count: int) -> list[ExpertState]:
-    """Play the perturbed expert in the episode of a seed, demonstration prompt and all, and return ``count`` states.
-
-    Fewer of a short episode.
-    """
+    """Play the perturbed expert in the episode of a seed, prompt and all; return at most ``count`` states."""
     rng = generator(episode.published, seed, STATE_STREAM)
     episode.reset(seed)
     perturbation, states = Perturbation(rng), []
@@ -195,8 +174,6 @@ def _state(episode: Episode) -> ExpertState:
 
 
 class _Scenes:
-    """One episode's scene, as it is and with distractors."""
-
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         self._sim, self._crowd = sim, with_distractors(sim, rng)
         self._fixed = sim.fixture_poses()

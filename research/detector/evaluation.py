@@ -19,9 +19,8 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_memobench.datasets.card import markdown as table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import write_file
-from lerobot_memobench.perception.detector import Detections, detections
+from lerobot_memobench.perception.detector import Detections, detections, load_detector
 from lerobot_memobench.perception.objects import LIT, ObjectLocalizer
-from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.data import SCENES, Pictures
 from research.detector.labels import Rows, images_of, kinds
@@ -46,14 +45,7 @@ Localise = Callable[[Rows], tuple[NDArray[np.int64], NDArray[np.float64], NDArra
 
 
 def evaluate(file: Path, folder: Path, pictures: Callable[[], Pictures]) -> str:
-    """Evaluate the detector of a file, write table and numbers to a folder, and return the table.
-
-    Args:
-        pictures: makes the labelled images, both cameras' of each frame one after the other.
-
-    Raises:
-        MemobenchError: the file holds no detector, or one of other kinds.
-    """
+    """Evaluate the detector of a file on images, both cameras' of each frame in turn, and return the written table."""
     detector = load_detector(file)
     if detector.kinds != kinds():
         raise MemobenchError(f"the detector of {file} knows other kinds of objects than this version; train a new one")
@@ -83,11 +75,7 @@ def localising(localizer: ObjectLocalizer) -> Localise:
 
 
 def outcomes(localise: Localise, pictures: Pictures) -> tuple[Outcomes, Outcomes]:
-    """Return the outcome of every visible object (n,), and the false detections (m,).
-
-    Args:
-        pictures: both cameras' of each frame, one after the other.
-    """
+    """Return the outcomes of visible objects (n,) and false detections (m,); images are both cameras' of each frame."""
     right: list[Outcomes] = [np.zeros(0, OBJECT)]
     wrong: list[Outcomes] = [np.zeros(0, OBJECT)]
     for start in range(0, len(pictures), len(MJCF_CAMERAS)):
@@ -101,7 +89,6 @@ def outcomes(localise: Localise, pictures: Pictures) -> tuple[Outcomes, Outcomes
 def _frame_outcomes(
     rows: Rows, found_kinds: NDArray[np.int64], found_at: NDArray[np.float64], lit: NDArray[np.bool_]
 ) -> tuple[Outcomes, Outcomes]:
-    """Return the outcomes of one frame, and its false detections."""
     shown = [one for row in rows for one in row["things"][: row["count"]]]
     true = {(int(one["kind"]), *one["position"]): one for one in shown}
     visible = {(int(one["kind"]), *one["position"]) for one in shown if one["pixels"] >= VISIBLE}
@@ -168,7 +155,6 @@ def figures(found: Outcomes, false: Outcomes) -> list[dict[str, Any]]:
 
 
 def _percentile(values: NDArray[Any], percent: int) -> float | None:
-    """Return a percentile, None if it is infinite."""
     found = float(np.percentile(values, percent, method="higher"))
     return round(found, 4) if math.isfinite(found) else None
 

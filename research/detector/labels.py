@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.objects import DRAWERS, PARTS
+from lerobot_memobench.perception.objects import DRAWERS, PARTS, View
 from lerobot_memobench.perception.visual_encoder import SIDE, area_averaged
 from lerobot_memobench.sim.mjcf import known_classes
 from lerobot_memobench.sim.object_layout import SLOTS
@@ -67,11 +67,7 @@ def kinds() -> tuple[str, ...]:
 
 
 def kinds_of(sim: Simulation, things: list[Thing]) -> list[int]:
-    """Return the index of the kind of each object of a scene.
-
-    Raises:
-        MemobenchError: a drawer of a fixture that was registered from outside is none of the three.
-    """
+    """Return the index of the kind of each object of a scene."""
     regions = {
         int(sim.model.joint(part.joint).qposadr[0]): region
         for asset in sim.assets.values()
@@ -89,6 +85,15 @@ def kinds_of(sim: Simulation, things: list[Thing]) -> list[int]:
     return [kinds().index(name) for name in names]
 
 
+def projected(positions: Array, view: View) -> tuple[Array, Array]:
+    """Project points (..., 3) of the world: places (..., 2) in the image, and depths (...) along the view, m."""
+    local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
+    depth = -local[..., 2]
+    # Points in the camera's plane have no place; the bound keeps theirs finite.
+    reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
+    return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
+
+
 def images_of(rows: Rows) -> torch.Tensor:
     """Return the images of rows (N,) as the encoder takes them, float (N, 3, SIDE, SIDE) in [0, 1]."""
     return torch.from_numpy(rows["pixels"]).float() / 255
@@ -104,7 +109,6 @@ class Labeller:
 
     @cached_property
     def _cells(self) -> NDArray[np.int64]:
-        """The centre pixel of each of the masks' cells, along one side."""
         side = self._sim.render_settings.height
         return ((np.arange(MASK) + 0.5) * side / MASK).astype(np.int64)
 
@@ -142,7 +146,6 @@ class Labeller:
         return labels[counts > 0]
 
     def _turn(self, body: int, camera: Array) -> Array:
-        """Return cosine and sine (2,) of twice the angle of a body's x axis in the image."""
         if body in self._round:
             return np.full(2, np.nan)
         x, y, _ = camera.T @ self._sim.data.xmat[body].reshape(3, 3)[:, 0]

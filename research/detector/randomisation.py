@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from lerobot_memobench.experts.demonstration_prompt import highlight_of
+from lerobot_memobench.experts.expert import highlight_of
 from lerobot_memobench.experts.hand import downward
 from lerobot_memobench.sim.asset import TABLE, TABLE_TOP, Asset, Grasp
 from lerobot_memobench.sim.object_layout import SLOTS
@@ -102,7 +102,6 @@ class DomainRandomisation:
         return (highlight_of(self._sim, str(self._rng.choice(list(self._objects)))),)
 
     def _move_fixtures(self) -> None:
-        """Move fixtures a little, and their moving parts anywhere in their range, half of them to one of its ends."""
         model, rng = self._sim.model, self._rng
         for name in self._sim.fixture_poses():
             body = model.body(name).id
@@ -117,7 +116,6 @@ class DomainRandomisation:
         settle(self._sim)
 
     def _put(self, name: str) -> None:
-        """Put an object on the table, on or into something, or away."""
         rng, asset = self._rng, self._objects[name]
         if rng.random() < ABSENT:
             self._take_away(name)
@@ -136,7 +134,6 @@ class DomainRandomisation:
         self._write(name, standing(asset, x, y, z, turn))
 
     def _on(self, asset: Asset, other: Asset) -> tuple[float, float, float]:
-        """Return a place on another object, or in one of a fixture's regions, on its floor or on its top."""
         rng, sim = self._rng, self._sim
         if not other.regions:
             x, y, z = sim.body_pose(other.name)[0] + [*(rng.normal(size=2) * other.clear_radius / 4), other.supports]
@@ -150,7 +147,6 @@ class DomainRandomisation:
         return float(x), float(y), float(z)
 
     def _reach(self) -> bool:
-        """Bend the arm to a pose above an object or a handle, the nearer the likelier."""
         rng, sim = self._rng, self._sim
         goals = [(*sim.asset_pose(name), asset.grasps[0]) for name, asset in self._objects.items() if asset.grasps]
         places = [(place + turned @ np.array(grasp.position), grasp.yaw) for place, turned, grasp in goals]
@@ -166,7 +162,6 @@ class DomainRandomisation:
         return reach(sim, place, tilt.as_matrix() @ downward(yaw + rng.choice([0.0, np.pi])))
 
     def _hold(self, name: str) -> None:
-        """Put an object between the fingers."""
         grasps, rng = self._objects[name].grasps, self._rng
         if not grasps:
             return
@@ -182,11 +177,9 @@ class DomainRandomisation:
             self._sim.data.joint(joint).qpos[0] = sign * half
 
     def _take_away(self, name: str) -> None:
-        """Put an object where no camera looks, each at a place of its own."""
         self._write(name, away(list(self._objects).index(name)))
 
     def _write(self, name: str, upright: Array) -> None:
-        """Set the pose (7,) of an object's `Asset` frame."""
         frame = self._objects[name].upright
         if frame is not None:
             turn = Rotation.from_quat(upright[3:], scalar_first=True)
@@ -202,7 +195,6 @@ class DomainRandomisation:
         return {name for pair in pairs if pair != {held, ARM} for name in pair} - {"world", held}
 
     def _root(self, body: int) -> str:
-        """The name of the root of a body's tree: an instance, or the arm."""
         model = self._sim.model
         return str(model.body(model.body_rootid[body]).name)
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_memobench.perception.detector import Detector
-from lerobot_memobench.perception.weights import SHIPPED, load_detector, save_detector
+from lerobot_memobench.perception.detector import SHIPPED, Detector, load_detector, save_detector
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
 from research.detector.__main__ import main
 from research.detector.data import TESTED, DetectorData, Pictures
@@ -23,7 +22,6 @@ from tests.support.labelled_images import BOWLS, DRAWERS, small_encoder, synthet
 
 @pytest.fixture
 def frames(tmp_path: Path) -> Callable[..., Pictures]:
-    """Return a function that saves four frames with three objects, the second one visible to the wrist alone."""
 
     def save(**changed: Any) -> Pictures:
         rows = np.repeat(synthetic(4), 2)
@@ -39,7 +37,6 @@ def frames(tmp_path: Path) -> Callable[..., Pictures]:
 
 
 def detector(*, off: float = 0.0, kind: int = 0, without: int = 0) -> Localise:
-    """Return a detector whose positions are off by so many metres, or whose kinds are others."""
 
     def localise(rows: Rows) -> Any:
         things = rows[0]["things"][without : rows[0]["count"]]

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_memobench.perception.objects import projected, rays
+from lerobot_memobench.perception.objects import rays
 from lerobot_memobench.perception.visual_encoder import SIDE
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS
-from research.detector.labels import MASK, Labeller, kinds
+from research.detector.labels import MASK, Labeller, kinds, projected
 from tests.support.labelled_images import BOWLS, DRAWERS, simulation
 
 

@@ -11,14 +11,12 @@ import pytest
 import torch
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.detector import Detector, detections
-from lerobot_memobench.perception.objects import projected
+from lerobot_memobench.perception.detector import Detector, detections, load_detector, save_detector
 from lerobot_memobench.perception.visual_encoder import GRID, SIDE
-from lerobot_memobench.perception.weights import load_detector, save_detector
 from lerobot_memobench.sim.asset import TABLE_TOP
 from research.detector import training
 from research.detector.data import Pictures
-from research.detector.labels import Rows, images_of
+from research.detector.labels import Rows, images_of, projected
 from research.detector.training import (
     CELLS,
     CHECKPOINT,
@@ -57,7 +55,6 @@ class Stopped(Exception):
 
 @pytest.fixture
 def pictures(tmp_path: Path) -> Pictures:
-    """Twelve pictures on disk."""
     np.save(tmp_path / "pictures.npy", synthetic(12))
     return Pictures([tmp_path / "pictures.npy"])
 

@@ -31,14 +31,13 @@ from lerobot_memobench.perception.detector import (
     Heads,
     PyramidLevel,
     peaks,
+    save_detector,
 )
-from lerobot_memobench.perception.objects import projected
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, VisualEncoder
-from lerobot_memobench.perception.weights import save_detector
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.training.loop import keep_freed_memory
 from research.detector.data import Pictures
-from research.detector.labels import MASK, Rows, images_of
+from research.detector.labels import MASK, Rows, images_of, projected
 
 CHECKPOINT, LAST_CHECKPOINT = "training.pt", "last.pt"
 WEIGHTS, LOSSES = "detector.safetensors", "losses.csv"
@@ -82,12 +81,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Training:
-    """Settings of a training.
-
-    Attributes:
-        updates: number. batch: images of each. rate: highest learning rate; it rises for a twentieth of the updates
-            and falls as a cosine. decay: weight decay. seed: of weights, order and augmentation.
-    """
+    """Settings of a training; ``rate`` is the highest learning rate, after a twentieth of the updates."""
 
     updates: int = 18_000
     batch: int = 32
@@ -106,15 +100,7 @@ def train(
     save_every: int = 50,
     progress: Progress | None = None,
 ) -> Path:
-    """Train a detector, or resume the training that a folder holds; return the file of its weights.
-
-    Args:
-        pictures: labelled images. kinds: names of the objects in them. folder: for checkpoint, losses and weights.
-        encoder: makes the one to train. save_every: updates between two checkpoints.
-
-    Raises:
-        MemobenchError: the folder's training has other settings.
-    """
+    """Train a detector of ``kinds``, or resume the training in ``folder``; return the file of its weights."""
     folder.mkdir(parents=True, exist_ok=True)
     keep_freed_memory()
     torch.manual_seed(settings.seed)
@@ -157,8 +143,6 @@ class TokenHeads(nn.Module):
 
 
 class _Trainer:
-    """A detector with its optimizer, its place in the run and its losses."""
-
     def __init__(self, model: TokenHeads, settings: Training, pictures: int) -> None:
         self.model, self._settings, self._pictures = model, settings, pictures
         model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -236,10 +220,7 @@ def train_last(
     checkpoint: Path | None = None,
     save_every: int = 50,
 ) -> None:
-    """Train expected errors and refinement head of a trained detector; all else in it stays as it is.
-
-    It resumes from a checkpoint, if there is one.
-    """
+    """Train expected errors and refinement head of a trained detector, or resume this; all else in it stays."""
     detector.eval().requires_grad_(False)
     uncertainty, refinement = detector.fine_heads.uncertainty, detector.refinement_head
     assert uncertainty is not None
@@ -279,7 +260,6 @@ def train_last(
 
 
 def _sample(pictures: Pictures) -> Iterator[Tensor]:
-    """Yield batches of images from all over."""
     chosen = np.linspace(0, len(pictures) - 1, min(len(pictures), WHITENING_IMAGES)).astype(np.int64)
     for indices in np.array_split(chosen, -(-len(chosen) // BATCH)):
         yield images_of(pictures.rows(indices))
@@ -298,7 +278,6 @@ def _permutation(seed: int, epoch: int, count: int) -> NDArray[np.int64]:
 
 
 def _generator(settings: Training, update: int) -> torch.Generator:
-    """Return the generator of an update's augmentation."""
     return torch.Generator().manual_seed(settings.seed * 2**32 + update)
 
 
@@ -331,11 +310,7 @@ class Targets:
 
 
 def targets(rows: Rows, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE) -> Targets:
-    """Return the targets of labelled images (N,).
-
-    Args:
-        kinds, grid, fine, coarse: as of `detector.Heads`.
-    """
+    """Return the targets of labelled images (N,); other arguments as of `detector.Heads`."""
     images, places = np.nonzero(
         (np.arange(rows["things"].shape[1]) < rows["count"][:, None]) & (rows["things"]["pixels"] >= LEAST_PIXELS)
     )
@@ -411,11 +386,7 @@ def _heat_loss(logits: Tensor, heat: Tensor) -> Tensor:
 
 
 def uncertainty_loss(output: DetectorOutput, wanted: Targets) -> Tensor:
-    """Return the negative log likelihood of the geometry's errors, Laplace distributed; no gradient reaches those.
-
-    Raises:
-        ValueError: the output has no uncertainty.
-    """
+    """Return the negative log likelihood of the geometry's errors, Laplace distributed; no gradient reaches those."""
     if output.uncertainty is None:
         raise ValueError("these heads predict no uncertainty")
     off = (output.geometry(*wanted.cells.T).detach() - wanted.geometry).abs()
@@ -428,9 +399,6 @@ def score_loss(output: DetectorOutput, wanted: Targets) -> Tensor:
     """Return the cross entropy of the scores of all peaks, plus that of all kinds at their cells.
 
     The second counts as much and trains the same network.
-
-    Raises:
-        ValueError: the output has no score.
     """
     if output.score is None:
         raise ValueError("this output is not refined")
@@ -472,8 +440,6 @@ def whiten(detector: Detector, batches: Iterable[Tensor]) -> None:
 
 
 class _Moments:
-    """Mean (d,) and covariance (d, d) of rows that come in parts."""
-
     def __init__(self, width: int) -> None:
         self.count, self.total = 0, torch.zeros(width, dtype=torch.float64)
         self.squares = torch.zeros(width, width, dtype=torch.float64)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_memobench.experts.expert import counts_events, plan_of, steps_of
-from lerobot_memobench.tasks.evidence import handled_atoms
+from lerobot_memobench.tasks.assessment import handled_atoms
 from lerobot_memobench.tasks.formula import Atom, Hold, Not
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.judge.stage import DWELL, Move, Stage, Verdict, judge
@@ -34,7 +34,7 @@ class Case:
         kind: name of the near miss; "right …" for episodes to accept.
         accepted: the verdict that the instruction asks for.
         checkpoint: number of checkpoints that are complete if the case is accepted; None: the goal is reached.
-        choice: whether acceptance is a choice that fits the variant (`tasks.evidence`).
+        choice: whether acceptance is a choice that fits the variant (`tasks.assessment`).
     """
 
     kind: str
@@ -77,7 +77,6 @@ class _Cases:
     # --- a right episode ---
 
     def _right_moves(self) -> Moves:
-        """Return the moves of the expert's plan."""
         goal = self.task.goal
         formulas = (*(checkpoint.goal for checkpoint in self.task.checkpoints), goal)
         steps: Sequence[Atom | Hold] = [step for formula in formulas for step in steps_of(formula)]
@@ -113,7 +112,6 @@ class _Cases:
         return AWAY, Move("put", name, place, steps=lasts)
 
     def _events(self) -> list[slice]:
-        """Return the moves that open and close, or turn on and off, one joint."""
         found, begun = [], 0
         for i, move in enumerate(self.right):
             if move.opens:
@@ -141,7 +139,6 @@ class _Cases:
     # --- checkpoints ---
 
     def _of_checkpoints(self) -> Iterator[Case]:
-        """Yield near misses of the move that completes each checkpoint."""
         whole = self.stage.record(self.right)
         counts = [0, *(judge(self.stage, whole[: i + 1]).checkpoints for i in range(len(whole)))]
         for i, (move, before, done) in enumerate(zip(self.right, counts, counts[1:], strict=False)):
@@ -203,7 +200,6 @@ class _Cases:
         return [name for name, other in self.task.objects.items() if other == kind and name not in taken]
 
     def _out_of_place(self, move: Move) -> Iterator[tuple[str, Moves]]:
-        """Yield near misses of taking an object out of a drawer."""
         yield "touched, not moved", ()
         drawer = next(one.name for one in self.right if one.opens)
         yield "moved within the drawer", (replace(move, place=drawer, offset=(0.0, 0.02, 0.0)),)
@@ -239,7 +235,6 @@ class _Cases:
             yield Case("hand not home in between", (*hasty, *(() if self.puts else (HOME,)), self.right[-1]))
 
     def _of_rest(self) -> Iterator[Case]:
-        """Yield episodes that hold or rest too short, or with a joint left ajar."""
         last = self.right[-1]
         if self.task.memory_type == "procedural":
             out = Move("put", last.name, offset=(0.0, 0.0, 0.1), steps=2 * THEN)
@@ -260,7 +255,6 @@ class _Cases:
         )
 
     def _of_places(self) -> Iterator[Case]:
-        """Yield strict episodes in which the scene is not left as it was."""
         if not self.strict or HOME not in self.right[1:]:
             return
         name = self.puts[0].name if self.puts else next(iter(self.task.objects))

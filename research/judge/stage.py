@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.asset import TABLE, TABLE_TOP
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.evidence import Choice, handled_atoms
+from lerobot_memobench.tasks.assessment import Choice, handled_atoms
 from lerobot_memobench.tasks.formula import LATCHES, Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -77,11 +77,7 @@ class Verdict(NamedTuple):
 
 
 class Stage:
-    """The scene of one variant of a task, at the start of the execution.
-
-    Attributes:
-        recording: states since the start.
-    """
+    """The scene of one variant of a task at the start of the execution; ``recording`` holds the states since."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -164,7 +160,6 @@ class Stage:
             self._set_position(one, sim.body_pose(one)[0] + sim.body_pose(name)[0] - before)
 
     def _lower(self, name: str, target: str) -> None:
-        """Lower an object from above until it touches the target."""
         if target == TABLE:
             place = self.sim.body_pose(name)[0]
             self._set_position(name, np.array([*place[:2], TABLE_TOP - self.sim.assets[name].bottom]))

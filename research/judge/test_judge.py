@@ -31,12 +31,10 @@ FEW = [COUNTING, PLACING]
 
 @cache
 def rows(name: str) -> list[Row]:
-    """Return the verdicts on a task's cases."""
     return rows_of(name)
 
 
 def of_all(names: list[str]) -> list[object]:
-    """Return parameters: a few tasks by default, the others as slow tests."""
     return [pytest.param(name, marks=() if name in FEW else pytest.mark.slow) for name in names]
 
 

@@ -16,8 +16,7 @@ import typer
 from lerobot_memobench.cli.console import console, counting, say
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.io import write_file
-from lerobot_memobench.jobs.processes import Advance, Job
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, Job, run_jobs
 from research.command import run
 from research.kept import keep as keep_evaluations
 from research.kept import restore

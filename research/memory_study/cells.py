@@ -1,6 +1,7 @@
 """A cell of the study: a training, its evaluation and its controls, each a command of the product that is run once.
 
-The same call resumes a killed cell: a training from its last checkpoint, an evaluation from its log.
+The same call resumes a killed cell: a training from its last checkpoint, an evaluation from its log. A result of other
+words than the grid's is an error.
 """
 
 from __future__ import annotations
@@ -55,11 +56,7 @@ class Demonstrations:
         run_once(self._words, self._log, how=how, accept=(0, 1), proof=self.folder / INFO_FILE)
 
     def finished(self) -> bool:
-        """Whether they are complete.
-
-        Raises:
-            MemobenchError: the existing ones were made by other words than the grid's.
-        """
+        """Whether they are complete."""
         return ended_as(self._log, self._words)
 
     def failure(self) -> str | None:
@@ -123,21 +120,13 @@ class Cell:
         return self.folder / f"{folder_name(part)}.log"
 
     def run(self) -> None:
-        """Train, then evaluate; skip commands that have ended.
-
-        Raises:
-            MemobenchError: a command failed, or an earlier result was made by other words than the grid's.
-        """
+        """Train, then evaluate; skip commands that have ended."""
         train_once(self.training_words(), self.log(TRAINING), self.policy, at_once=self.at_once)
         for part in self.parts:
             run_once(self.evaluation_words(part), self.log(part), how=["resume=true"], at_once=self.at_once)
 
     def finished(self) -> bool:
-        """Whether everything is done.
-
-        Raises:
-            MemobenchError: a result was made by other words than the grid's, or is of a policy that is missing.
-        """
+        """Whether everything is done."""
         trained = self.done(TRAINING)
         evaluated = [part for part in self.parts if self.done(part)]
         if evaluated and not trained:
@@ -147,11 +136,7 @@ class Cell:
         return trained and len(evaluated) == len(self.parts)
 
     def done(self, part: str) -> bool:
-        """Return whether the training, the evaluation or a control has ended well.
-
-        Raises:
-            MemobenchError: it was of other words than the grid's.
-        """
+        """Return whether the training, the evaluation or a control has ended well."""
         words = self.training_words() if part == TRAINING else self.evaluation_words(part)
         return ended_as(self.log(part), words)
 
@@ -165,13 +150,8 @@ class Cell:
         return None
 
     def check(self) -> None:
-        """Refuse invalid words of its commands before any is run; datasets and policies need not exist.
-
-        Raises:
-            MemobenchError: an unknown setting or value, with the nearest known one.
-        """
-        from lerobot_memobench.rollouts.plan import take_run_options
-        from lerobot_memobench.rollouts.settings import read_settings
+        """Refuse invalid words of its commands before any is run; datasets and policies need not exist."""
+        from lerobot_memobench.rollouts.plan import read_settings, take_run_options
 
         words = self.training_words()
         check_training(words)
@@ -211,11 +191,7 @@ class Cell:
 
 
 def ended_as(log: Path, words: Sequence[str]) -> bool:
-    """Return whether the command of a log has ended well.
-
-    Raises:
-        MemobenchError: it had other words. The study's folder may differ.
-    """
+    """Return whether the command of a log has ended well."""
     kept = kept_of(log)
     if kept is None:
         return False
@@ -241,5 +217,4 @@ def _in_any_folder(words: Iterable[str]) -> list[str]:
 
 
 def _last_of_each(words: Sequence[str]) -> list[str]:
-    """Return the last word of each key."""
     return list({word.partition("=")[0]: word for word in words}.values())

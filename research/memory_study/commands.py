@@ -31,7 +31,6 @@ class Cost:
     cpu_s: float
 
     def __add__(self, other: Cost) -> Cost:
-        """Return the sum of both."""
         return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
 
 
@@ -71,9 +70,6 @@ def run_once(
         resume_by: command that resumes an earlier attempt.
         makes: folder that the command refuses to find. Without ``resume_by`` it is removed first.
         proof: file that shows that an accepted command did its work.
-
-    Raises:
-        MemobenchError: the command failed or is running, or the log is of another command.
     """
     kept, spent = log.with_suffix(".json"), Cost(0.0, 0.0)
     if earlier := kept_of(log):
@@ -125,11 +121,7 @@ def has_ended(log: Path) -> bool:
 
 
 def train_once(words: Sequence[str], log: Path, policy: Path, *, at_once: int = 1) -> Cost:
-    """Run ``lerobot train …`` into the folder ``policy``, or resume its last checkpoint; see `run_once`.
-
-    Raises:
-        MemobenchError: as `run_once`; or there is a checkpoint without the file of its command.
-    """
+    """Run ``lerobot train …`` into the folder ``policy``, or resume its last checkpoint; see `run_once`."""
     from lerobot_memobench.training.command import TRAIN_CONFIG, last_checkpoint
 
     try:
@@ -146,11 +138,7 @@ def train_once(words: Sequence[str], log: Path, policy: Path, *, at_once: int = 
 
 
 def check_training(words: Sequence[str]) -> None:
-    """Refuse invalid words of ``lerobot train …`` before it is run; its dataset need not exist yet.
-
-    Raises:
-        MemobenchError: an unknown setting or value, with the nearest known one.
-    """
+    """Refuse invalid words of ``lerobot train …`` before it is run; its dataset need not exist yet."""
     from lerobot_memobench.commands.command_line import read_words
     from lerobot_memobench.training.command import take_training_options
 

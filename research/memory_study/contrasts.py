@@ -21,9 +21,9 @@ from lerobot_memobench.evaluation.statistics import (
     Array,
     Estimate,
     detectable,
-    difference_interval,
     holm,
     interval_of,
+    newcombe,
     sign_flip,
 )
 
@@ -38,8 +38,7 @@ class SeedContrast:
     Attributes:
         low, high: 95 % interval over training seeds and episodes.
         p: of sign flips of the episodes' differences, each the mean over training seeds.
-        episodes: number of pairs.
-        detectable: smallest true difference that so many episodes show with 80 % power at 5 %; None above 1.
+        detectable: see `statistics.detectable`.
         of_seeds: the difference of each training seed.
         p_of_seeds: of a paired t test over them; None with fewer than three.
     """
@@ -55,11 +54,7 @@ class SeedContrast:
 
 
 def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str = "reference") -> SeedContrast:
-    """Return a row's difference from a reference with the same training seeds; its p are not adjusted.
-
-    Raises:
-        MemobenchError: the episodes or their scenes differ.
-    """
+    """Return a row's difference from a reference with the same training seeds; its p are not adjusted."""
     episodes, rng = episodes_of(reference), np.random.default_rng(0)
     weights, tasks = _weights(reference[0], episodes)
     base = _successes(reference, episodes, reference_name)
@@ -67,7 +62,7 @@ def contrast(runs: Runs, reference: Runs, name: str = "row", reference_name: str
     gap = _successes(runs, episodes, name) - base
     of_seeds = gap @ weights
     before = base.mean(axis=0)  # an episode counts once, however many policies were trained
-    low, high = difference_interval(_draws(gap, weights, tasks, rng), before, before + gap.mean(axis=0), weights)
+    low, high = interval_of(_draws(gap, weights, tasks, rng), newcombe(before, before + gap.mean(axis=0), weights))
     return SeedContrast(
         float(of_seeds.mean()),
         low,
@@ -122,7 +117,6 @@ def episodes_of(runs: Runs) -> list[Key]:
 
 
 def _check_scenes(runs: Runs, reference: Runs, name: str, reference_name: str) -> None:
-    """Refuse episodes whose suite or variant differs from the reference's, where both are known."""
     others = {_key(record): record for records in reference for record in records}
     for record in (record for records in runs for record in records):
         other = others.get(_key(record), {})
@@ -135,7 +129,6 @@ def _check_scenes(runs: Runs, reference: Runs, name: str, reference_name: str) -
 
 
 def _successes(runs: Runs, episodes: Sequence[Key], name: str) -> Array:
-    """Return success (training seeds, episodes), 0 or 1."""
     found = [{_key(record): float(bool(record["success"])) for record in records} for records in runs]
     if any(sorted(each) != list(episodes) for each in found):
         raise MemobenchError(f"{name!r} has other episodes; finish all rows with the same seeds")
@@ -156,7 +149,6 @@ def _weights(records: Sequence[Record], episodes: Sequence[Key]) -> tuple[Array,
 
 
 def _draws(table: Array, weights: Array, tasks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
-    """Return bootstrap draws of the weighted mean of a table (training seeds, episodes)."""
     seeds = rng.multinomial(len(table), np.full(len(table), 1 / len(table)), DRAWS) / len(table)
     times = np.empty((DRAWS, table.shape[1]))  # how often each episode is drawn
     for indices in tasks:

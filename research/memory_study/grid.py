@@ -143,17 +143,12 @@ class Grid:
 
 
 def _refuse_words(where: str, words: Iterable[str], keys: Iterable[str]) -> None:
-    """Refuse words that the study sets itself, the same for all rows."""
     if own := [key for key in keys if word_of(words, key) is not None]:
         raise MemobenchError(f"{where}: {own[0]}= is set by the study, the same for all rows; leave it out")
 
 
 def read_grid(path: Path) -> Grid:
-    """Read a study's file.
-
-    Raises:
-        MemobenchError: it cannot be read, or a row, control or field is unknown.
-    """
+    """Read a study's file."""
     try:
         with path.open(encoding="utf-8") as file:
             _check_keys(yaml.compose(file, yaml.SafeLoader))
@@ -174,9 +169,6 @@ def chosen(grid: Grid, only: Iterable[str]) -> list[tuple[str, str, int]]:
     """Return the cells that words name: a suite, a row or a seed (``strict``, ``bank``, ``seed=0``); by none all.
 
     Several words of one kind are alternatives; words of different kinds must all hold.
-
-    Raises:
-        MemobenchError: an unknown word.
     """
     suites, rows, seeds = set[str](), set[str](), set[int]()
     for word in only:
@@ -207,10 +199,10 @@ def word_of(words: Iterable[str], key: str) -> str | None:
 
 
 def _check_keys(node: yaml.Node | None) -> None:
-    """Refuse a key that is given twice: YAML would silently take the last."""
     if isinstance(node, yaml.MappingNode):
         keys = [key.value for key, _ in node.value]
         if twice := [key for key in keys if keys.count(key) > 1]:
+            # YAML would silently take the last value.
             raise MemobenchError(f"{twice[0]!r} is given twice{node.start_mark}; rename one")
     for child in node.value if isinstance(node, yaml.CollectionNode) else ():
         for part in child if isinstance(child, tuple) else (child,):

@@ -35,9 +35,6 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
     """Return the Markdown of a suite's rows; "" where none is evaluated.
 
     A row is shown as soon as one of its training seeds has been evaluated, with their number.
-
-    Raises:
-        MemobenchError: a result is of another grid, or a cell of two policies.
     """
     rows = evaluated_rows(grid, out, suite)
     if not rows:
@@ -59,10 +56,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> "solved" (SR) and "follows" per training seed, and the best success "without" a memory.
-
-    Per cent.
-    """
+    """Return title of a row -> "solved" (SR) and "follows" per training seed, and "without" a memory, per cent."""
     found, ceiling = {}, _ceiling(grid.suites[suite].ceilings)
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
@@ -83,11 +77,7 @@ def titles(grid: Grid) -> list[str]:
 
 
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return title -> evaluated cells of the rows of a suite.
-
-    Raises:
-        MemobenchError: a training, or an evaluation, is of other words than the grid's.
-    """
+    """Return title -> evaluated cells of the rows of a suite."""
     found: dict[str, list[Cell]] = {}
     for title, (name, row) in zip(titles(grid), grid.rows.items(), strict=True):
         for cell in (Cell(grid, out, suite, name, seed) for seed in range(row.seeds)):
@@ -103,11 +93,7 @@ def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
 
 
 def evaluated(cell: Cell, part: str) -> bool:
-    """Return whether a cell's evaluation, or a control, is done.
-
-    Raises:
-        MemobenchError: it is of other words than the grid's, or a log is there without them.
-    """
+    """Return whether a cell's evaluation, or a control, is done."""
     command, folder = cell.log(part).with_suffix(".json"), cell.evaluation(part)
     if folder.is_dir() and not command.exists():
         raise MemobenchError(f"{folder} exists, but {command} with its command is missing; remove the folder")
@@ -125,11 +111,7 @@ def _check_policies(rows: Rows) -> None:
 
 
 def report(cell: Cell, part: str) -> dict[str, Any]:
-    """Return the figures of an evaluation, counted from its log.
-
-    Raises:
-        MemobenchError: its card has another command than the cell, or asks for more rollouts than exist.
-    """
+    """Return the figures of an evaluation, counted from its log."""
     return _figures(cell.evaluation(part), tuple(cell.carded_words(part)))
 
 
@@ -157,7 +139,6 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
-    """Return figures that are not rounded, for means over training seeds."""
     rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in METRICS}
     return {"n": row["SR"].n, **rates}
 
@@ -216,7 +197,6 @@ def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
 
 
 def _by_memory_type(rows: Rows) -> str:
-    """Return a table like the paper's: four rates of each memory type."""
     header = ("", *(f"{kind} {metric}" for kind in MEMORY_TYPES for metric in METRICS))
     lines = []
     for row, cells in rows.items():
@@ -257,7 +237,6 @@ def _endings(rows: Rows) -> str:
 
 
 def _conditions(rows: Rows) -> str:
-    """Return SR in each other control, and its change from the same scenes without the control."""
     last = {row: cells[-1] for row, cells in rows.items()}
     parts = dict.fromkeys(part for cell in last.values() for part in cell.grid.rows[cell.row].controls)
     there = {row: [part for part in parts if part != EVIDENCE and evaluated(cell, part)] for row, cell in last.items()}
@@ -294,7 +273,6 @@ def _sealed(rows: Rows) -> str:
 
 
 def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
-    """Return success minus the ceiling, which is a number without an interval of its own."""
     ceiling = _ceiling(ceilings)
     if ceiling is None:
         return ""
@@ -309,7 +287,6 @@ def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
 
 
 def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
-    """Return a table of each row against a reference, by the training seeds that both have evaluated so."""
     base = {cell.seed: cell for cell in rows.get(reference, ()) if evaluated(cell, part)}
     found = {}
     for row, own in rows.items():
@@ -350,7 +327,6 @@ def table_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _costs(rows: Rows) -> str:
-    """Return wall time of a training, and of a control step of a rollout, on a shared machine."""
     lines = []
     for row, cells in rows.items():
         trained = [cost[TRAINING].wall_s / 60 for cell in cells if TRAINING in (cost := cell.costs())]

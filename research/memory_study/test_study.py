@@ -276,7 +276,6 @@ def rollout_of(episode: int, evidence: bool, solved: int) -> dict[str, Any]:
 
 
 def evaluate(cell: Cell, *parts: str, rollouts: int = 10, solved: int = 4, **more: Any) -> None:
-    """Let these parts of a cell be evaluated, with so many rollouts each."""
     for part in parts:
         episodes = [rollout_of(episode, part == "evidence", solved) | more for episode in range(rollouts)]
         (cell.evaluation(part) / "evaluation.json").unlink(missing_ok=True)

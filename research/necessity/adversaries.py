@@ -38,8 +38,8 @@ from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import classes
 from lerobot_memobench.sim.scene import DEAD_CENTRE
 from lerobot_memobench.sim.simulation import Simulation
+from lerobot_memobench.tasks.assessment import chance
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import chance
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.task import STRICT, Task
 from research.command import run
@@ -376,7 +376,6 @@ def without_coming_home(seat: Seat) -> Motion:
 
 
 def _asked(seat: Seat) -> tuple[str, str]:
-    """Return the object that the instruction names, and its class."""
     assert seat.task.prompt is not None
     named = {name: split_class(seat.sim.assets[name].class_name)[0] for name, _ in seat.task.prompt.places}
     for name, kind in named.items():
@@ -464,7 +463,6 @@ def open_one(seat: Seat) -> Motion:
 
 
 def _fetch(seat: Seat) -> Motion:
-    """Put the requested object on the table while it is visible."""
     name, kind = _asked(seat)
     while seat.rows(kind):
         yield from seat.do(Atom("on", (name, "kitchen_table_table_region")))
@@ -480,7 +478,6 @@ def routine(choose: Callable[[Seat, int], int], seat: Seat) -> Motion:
 
 
 def _by_first_slot(seat: Seat, count: int) -> int:
-    """Read the order of equal objects in their slots."""
     return round(1e4 * float(np.abs(seat.episode.objects()).sum())) % count
 
 

@@ -88,7 +88,6 @@ class Clock:
         return max((self._climb(start, rng) for start in self._starts(rng)), key=lambda found: found[0])
 
     def _starts(self, rng: np.random.Generator) -> Iterator[Plan]:
-        """Yield plans that begin each choice at a bin, and wait before it."""
         for _ in range(STARTS):
             plan, at = np.full(BINS, self._wanted[-1]), 0
             for choice in self._wanted[:-1]:

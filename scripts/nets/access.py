@@ -33,10 +33,7 @@ def records_of(folder: Path) -> list[dict[str, Any]]:
 
 
 def run(program: str, *words: object, folder: Path | None = None) -> tuple[int, str]:
-    """Run a command in this process and in a folder; return exit status and output (standard output and errors).
-
-    The functions of our commands are those that `pyproject.toml` names.
-    """
+    """Run a command of `pyproject.toml`, or another, in this process and in a folder; return exit status and output."""
     output, before, line = io.StringIO(), Path.cwd(), [str(word) for word in words]
     ours = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     argv, sys.argv = sys.argv, [program, *line]

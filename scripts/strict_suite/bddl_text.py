@@ -50,7 +50,6 @@ def _declaration_rows(declared: dict[str, str]) -> list[str]:
 
 
 def _goal(formula: Formula, indent: str) -> list[str]:
-    """Return the formula on one line if it fits, else one child per line."""
     flat = indent + format_formula(formula)
     if len(flat) <= LONGEST_ROW or isinstance(formula, Atom):
         return [flat]

@@ -84,7 +84,6 @@ def _strict_task(name: str, published: str, language: str, family: str) -> Stric
 
 
 def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:
-    """Return a variant with the published checkpoints and a goal that forbids the steps of the other variants."""
     steps, others = _steps(one), [atom for other in shown for atom in _steps(other)]
     foreign = tuple(dict.fromkeys(atom for atom in others if atom not in steps))
     order = [When((later, Then((earlier,)))) for earlier, later in pairwise(steps)]
@@ -100,7 +99,6 @@ def _setting(one: Task, shown: Sequence[Task], language: str) -> Setting:
 
 
 def _steps(task: Task) -> list[Atom]:
-    """Return the atoms of the published checkpoints, in order."""
     return [atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)]
 
 

@@ -9,17 +9,18 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 
 from lerobot_memobench.constants import PUBLISHED_MUJOCO
 from lerobot_memobench.errors import unsupported_system
 from lerobot_memobench.io import cache_base
-from lerobot_memobench.jobs.threads import cores
-from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, places, unused, usable
+from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, find_assets
 from lerobot_memobench.tasks.catalogue import get_task
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
@@ -29,40 +30,22 @@ SHOWN = ("lerobot", "torch", "transformers", "mujoco", "numpy", "gymnasium", "to
 """Packages checked against the requirements of this project and of LeRobot."""
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")
 """Extras of LeRobot that this project installs."""
-DRAWN = "turn_on_the_stove_and_turn_it_off"
-
-Status = Literal["ok", "warning", "failed"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one check.
-
-    Attributes:
-        status: ``failed`` if the benchmark cannot run, ``warning`` if a part is missing or slow.
-        fix: how to repair it; empty if no action is needed.
-    """
+    """The result of one check; ``fix``: how to repair it, empty if no action is needed."""
 
     what: str
-    status: Status
+    status: Literal["ok", "warning", "failed"]  # failed: the benchmark cannot run
     detail: str
     fix: str = ""
 
 
 def examine() -> list[Finding]:
     """Run all checks. The import of LeRobot takes most of the time, some tens of seconds."""
-    return [
-        system(),
-        *package_versions(),
-        physics(),
-        opencv(),
-        plugin(),
-        caches(),
-        assets(),
-        image(),
-        video_decoding(),
-        device(),
-    ]
+    checks = (physics, opencv, plugin, caches, assets, image, video_decoding)
+    return [system(), *package_versions(), *(check() for check in checks)]
 
 
 def system() -> Finding:
@@ -93,13 +76,11 @@ def package_versions() -> Iterator[Finding]:
 def supported_versions() -> dict[str, SpecifierSet]:
     """Return package -> versions that both this project and LeRobot accept on this machine."""
     supported: dict[str, SpecifierSet] = {}
-    lines = [
-        line for owner in ("lerobot", DISTRIBUTION) if _installed(owner) for line in metadata.requires(owner) or ()
-    ]
-    for requirement in map(Requirement, lines):
+    lines = [metadata.requires(owner) or [] for owner in ("lerobot", DISTRIBUTION) if _installed(owner)]
+    for requirement in map(Requirement, chain(*lines)):
         marker = requirement.marker
         if marker is None or any(marker.evaluate({"extra": extra}) for extra in EXTRAS):
-            name = requirement.name.lower().replace("_", "-")
+            name = canonicalize_name(requirement.name)
             supported[name] = supported.get(name, SpecifierSet()) & requirement.specifier
     return supported
 
@@ -122,12 +103,11 @@ def physics() -> Finding:
 
 def opencv() -> Finding:
     """Check that only the headless distribution installs the module ``cv2``; the others need desktop libraries."""
-    contrib = "opencv-contrib-python"
-    names = ("opencv-python", "opencv-python-headless", contrib, f"{contrib}-headless")
-    installed = [name for name in names if _installed(name)]
-    if installed == ["opencv-python-headless"]:
-        return Finding("OpenCV", "ok", f"opencv-python-headless {_installed(installed[0])} alone")
-    wanted = f'pip install "opencv-python-headless{supported_versions().get("opencv-python-headless", "")}"'
+    headless, contrib = "opencv-python-headless", "opencv-contrib-python"
+    installed = [name for name in ("opencv-python", headless, contrib, f"{contrib}-headless") if _installed(name)]
+    if installed == [headless]:
+        return Finding("OpenCV", "ok", f"{headless} {_installed(headless)} alone")
+    wanted = f'pip install "{headless}{supported_versions().get(headless, "")}"'
     fix = f"pip uninstall -y {' '.join(installed)} && {wanted}" if installed else wanted
     return Finding("OpenCV", "warning", " and ".join(installed) or "not installed", fix)
 
@@ -163,11 +143,11 @@ def caches() -> Finding:
 
 def assets() -> Finding:
     """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
-    candidates = places()
-    if (place := usable(candidates)) is None:
-        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused(candidates)}", OBTAIN)
-    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused(candidates)}"
-    if candidates[0].fault and candidates[0].source == ASSETS_VARIABLE:
+    place, unused = find_assets()
+    if place is None:
+        return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused}", OBTAIN)
+    detail = f"LIBERO's, from {place.source}: {place.folder} (MIT, CC BY 4.0){unused}"
+    if ASSETS_VARIABLE in unused:
         return Finding("assets", "warning", detail, f"correct or unset {ASSETS_VARIABLE}")
     return Finding("assets", "ok", detail)
 
@@ -177,7 +157,7 @@ def image() -> Finding:
     try:
         from lerobot_memobench.sim.simulation import Simulation
 
-        simulation = Simulation(get_task(DRAWN))
+        simulation = Simulation(get_task("turn_on_the_stove_and_turn_it_off"))
         simulation.reset(0)
         height, width, _ = simulation.render("agentview").shape
     except Exception as error:
@@ -194,15 +174,6 @@ def video_decoding() -> Finding:
         detail = f"torchcodec does not load ({_in_one_line(error)}); LeRobot falls back to PyAV, which is slower"
         return Finding("video decoding", "warning", detail, "apt-get install ffmpeg (torchcodec needs its libraries)")
     return Finding("video decoding", "ok", "torchcodec loads FFmpeg's libraries")
-
-
-def device() -> Finding:
-    """Return the device on which policies run."""
-    import torch
-
-    if torch.cuda.is_available():
-        return Finding("device", "ok", f"{torch.cuda.get_device_name()} ({torch.cuda.device_count()} in total)")
-    return Finding("device", "ok", f"CPU, {cores()} cores; enough for the shipped policies and the expert")
 
 
 def _in_one_line(error: Exception) -> str:

@@ -16,13 +16,8 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lerobot_memobench.errors import MemobenchError, chain, in_words
-
-if TYPE_CHECKING:
-    pass
-
 
 DRAFT = ".part."
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -47,10 +42,10 @@ def draft_of(path: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield draft
         if durable:
-            _to_disk(draft)
+            flush_to_disk(draft)
         os.replace(draft, path)
         if durable:
-            _to_disk(path.parent)
+            flush_to_disk(path.parent)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -78,9 +73,7 @@ def refuse_links(*folders: Path) -> None:
 def file_name(text: object, what: str) -> str:
     """Return a name read from data after checking that it names a file in one folder.
 
-    Raises:
-        MemobenchError: it is no text, is empty or too long, begins with a dot, or has a separator or control character;
-            ``what`` is its role, such as ``the task's name in demo.hdf5``.
+    ``what`` is its role in the error, such as ``the task's name in demo.hdf5``.
     """
     if (
         not isinstance(text, str)
@@ -99,10 +92,7 @@ def file_name(text: object, what: str) -> str:
 def files_below(folder: Path, *endings: str) -> list[Path]:
     """Return the sorted files below a folder whose names end in one of ``endings``, in any letter case; none: all.
 
-    Links to folders are followed. Each folder is read once, so links in a circle end.
-
-    Raises:
-        MemobenchError: one of them is a pipe, a device or a broken link; or a folder cannot be read.
+    Links to folders are followed. A pipe, a device, a broken link and an unreadable folder raise `MemobenchError`.
     """
 
     def refuse(error: OSError) -> None:
@@ -115,7 +105,7 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
     seen: set[tuple[int, int]] = set()
     for directory, folders, names in os.walk(folder, onerror=refuse, followlinks=True):
         status = os.stat(directory)
-        if (status.st_dev, status.st_ino) in seen:
+        if (status.st_dev, status.st_ino) in seen:  # links in a circle
             folders.clear()
             continue
         seen.add((status.st_dev, status.st_ino))
@@ -138,14 +128,14 @@ def check_regular(path: Path) -> None:
         raise MemobenchError(f"{path} is a pipe, a device or a broken link, expected a file; remove it")
 
 
-def cache_folder() -> Path:
-    """Return the folder of caches."""
-    return cache_base() / "lerobot_memobench"
-
-
 def cache_base() -> Path:
     """Return the folder in which this package and its libraries (numba, torch, Hugging Face) keep caches."""
     return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def cache_folder() -> Path:
+    """Return the folder of this package's caches."""
+    return cache_base() / "lerobot_memobench"
 
 
 def choose_caches() -> None:
@@ -172,21 +162,18 @@ def choose_caches() -> None:
 
 
 def private_folder(shared: str) -> Path:
-    """Make and return this user's own folder in one that all users share, such as ``/tmp``.
-
-    Raises:
-        OSError: it cannot be made, or others may write to it. Caches hold code, so it must not be another user's.
-    """
+    """Make and return this user's own folder in one that all users share, such as ``/tmp``; raise `OSError`."""
     folder = Path(shared) / f"memobench-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     status = folder.lstat()
+    # Caches hold code, so the folder must not be another user's.
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o022:
         raise PermissionError(errno.EPERM, "others may write to this folder", str(folder))
     return folder
 
 
 def file_hash(path: Path) -> str:
-    """Return the sha256 (hex) of a file; cached per process until the file changes."""
+    """Return the sha256 (hex) of a file; computed again if the file changes."""
     status = os.stat(path)  # a changed file has another size, time or inode
     return _hash_of(str(path), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
@@ -222,9 +209,16 @@ def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
     except Exception as error:  # OSError, or an error of a library in C
         refusal, end = disk_refusal(error), kept and f"; {kept}"
         filename = getattr(error, "filename", None)
-        if refusal is None or (filename is not None and not _is_of(Path(os.fsdecode(filename)), out)):
+        if refusal is None:
             raise
-        if _output_refuses():
+        if filename is not None:
+            path, folder = Path(os.fsdecode(filename)).absolute(), out.absolute()
+            if not (path.is_relative_to(folder) or folder.is_relative_to(path)):  # a file that is read
+                raise
+        try:  # an error of `print` leaves text in the stream
+            for stream in filter(None, (sys.stdout, sys.stderr)):
+                stream.flush()
+        except (OSError, ValueError):  # ValueError: it is closed
             raise MemobenchError(
                 f"the output of this command cannot be written ({refusal}): send it elsewhere{end}"
             ) from error
@@ -232,22 +226,6 @@ def explaining_disk_errors(out: Path, kept: str = "") -> Iterator[None]:
             f"{out} cannot be written ({refusal}; {in_words(free_bytes(out))} are free there): make room, or name "
             f"another folder{end}"
         ) from error
-
-
-def _output_refuses() -> bool:
-    """Return whether an output of this process holds text that it cannot write, as after an error of `print`."""
-    try:
-        for stream in filter(None, (sys.stdout, sys.stderr)):
-            stream.flush()
-    except (OSError, ValueError):  # ValueError: it is closed
-        return True
-    return False
-
-
-def _is_of(path: Path, out: Path) -> bool:
-    """Return whether a path is ``out``, below it or above it; other paths are read."""
-    path, out = path.absolute(), out.absolute()
-    return path.is_relative_to(out) or out.is_relative_to(path)
 
 
 def free_bytes(folder: Path) -> int:
@@ -258,11 +236,13 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(folder).free
 
 
-def _to_disk(path: Path) -> None:
+def flush_to_disk(*paths: Path) -> None:
+    """Wait until the disk holds files, or the entries of folders."""
     if sys.platform == "win32":
         return  # it cannot open folders, or flush files that are open for reading
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    for path in paths:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -93,9 +93,7 @@ def check_fetched(path: Path) -> None:
 def file_bytes(path: Path) -> bytes:
     """Return the content of a file, or of the same file compressed by ``gzip`` if only that exists.
 
-    Raises:
-        OSError: neither exists, it cannot be read, is damaged, or is too large unpacked.
-        MemobenchError: it is a Git LFS pointer.
+    A missing, damaged or too large file raises `OSError`, a Git LFS pointer `MemobenchError`.
     """
     if path.suffix != PACKED and not path.exists() and packed(path).exists():
         path = packed(path)
@@ -115,11 +113,8 @@ def file_bytes(path: Path) -> bytes:
 def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any:
     """Return the content of a JSON file, which may be compressed (`file_bytes`).
 
-    ``nan`` allows NaN and Infinity, as in logs of a diverged training.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        MemobenchError: it cannot be read or does not match the schema; the message names the place and the ``advice``.
+    ``nan`` allows NaN and Infinity, as in logs of a diverged training. A missing file raises `FileNotFoundError`,
+    other content than the schema's a `MemobenchError` with the place and the ``advice``.
     """
     try:
         return checked(parsed(file_bytes(path), nan=nan), schema)
@@ -132,11 +127,7 @@ def read_json(path: Path, schema: Any, advice: str, *, nan: bool = False) -> Any
 
 
 def parsed(content: bytes | str, *, nan: bool = False) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        Malformed: it is no JSON, nested too deeply, or has NaN (unless ``nan``), lone surrogates or invalid UTF-8.
-    """
+    """Return the value of a JSON text; raise `Malformed`, also for NaN (unless ``nan``) and for invalid UTF-8."""
     from pydantic_core import from_json
 
     data = content.encode(errors="replace") if isinstance(content, str) else content
@@ -149,8 +140,7 @@ def parsed(content: bytes | str, *, nan: bool = False) -> Any:
 def checked(value: Any, schema: Any) -> Any:
     """Return a value that matches ``schema``: an instance if the schema is a pydantic model, else the value itself.
 
-    Raises:
-        Malformed: naming the first place that differs, its value and the expected one.
+    `Malformed` names the first place that differs, its value and the expected one.
     """
     from pydantic import BaseModel, ValidationError
 
@@ -168,9 +158,8 @@ def refusing(as_error: Callable[[str], MemobenchError], of: Path | None = None) 
     LeRobot, pyarrow, PyAV, h5py and NumPy raise errors of many types for damaged files. The block must not write,
     because an error in writing, such as a full disk, is not caused by the file.
 
-    Args:
-        as_error: adds file and fix to a library's message, shortened to one line.
-        of: file or folder that is read; if it is a Git LFS pointer, the message names that instead (`check_fetched`).
+    ``as_error`` adds file and fix to a library's message in one line. If ``of``, the file or folder that is read, is a
+    Git LFS pointer, the message names that instead.
     """
     try:
         yield

@@ -25,7 +25,7 @@ from lerobot_memobench.envs.settings import RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.evaluation.metrics import PROCESS_METRICS, rollout_value
 from lerobot_memobench.sim.convention import CONVENTIONS, STATED
-from lerobot_memobench.tasks.libero_suites import NUM_STATES
+from lerobot_memobench.tasks.catalogue import NUM_STATES
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 try:
@@ -51,8 +51,7 @@ class MEMOBench(StepBenchmark):
     position (3, m), axis-angle (3, rad), fingers (2, m); ``task_description``; ``step`` float32 (1,) and, with
     ``robot_state=True``, ``robot_state`` of `MemobenchEnv`. The first observation of an episode with a demonstration
     prompt also contains ``video_history`` and ``wrist_video_history``, lists of images, ``state_history``, a list of
-    states, and ``episode_restart``. Frames of the rest between prompt and execution are omitted, because they equal the
-    first observation.
+    states, and ``episode_restart``. Frames of the rest between prompt and execution equal it and are omitted.
 
     Action: ``actions`` float (7,) or (steps, 7) in [−1, 1], as of `MemobenchEnv`.
 
@@ -66,10 +65,8 @@ class MEMOBench(StepBenchmark):
         n_action_steps: actions executed per answer, open-loop.
         replan_steps: actions per plan of the server, which may answer one action and queue the rest (its
             ``chunk_size``); default ``n_action_steps``. Strict tasks need it, because holds are longer than a plan.
-        send_wrist_image: whether the wrist camera is sent. The harness sets this, the next two arguments and
-            ``trained_convention`` from the hello message of a model server.
-        send_state: whether the arm's state is sent.
-        send_video_history: whether the demonstration prompt is sent.
+        send_wrist_image, send_state, send_video_history: whether wrist camera, arm's state and demonstration prompt
+            are sent. The harness sets these and ``trained_convention`` from the hello message of a model server.
         log_dir: folder of the episode log for ``memobench report``; None for no log.
         label: name of the model server's policy in the log.
         trained_convention: of the images that the server's policy was trained on: the ``convention``, or refused.
@@ -244,12 +241,8 @@ class MEMOBench(StepBenchmark):
 
     def get_observation_spec(self) -> dict[str, specs.DimSpec]:
         """Return the conventions of the observation."""
-        images = {NAMES[name][0]: specs.IMAGE_RGB for name in self._cameras}
-        return {
-            **images,
-            "language": specs.LANGUAGE,
-            **({"state": specs.STATE_EEF_POS_AA_GRIP} if self._send_state else {}),
-        }
+        spec = {NAMES[name][0]: specs.IMAGE_RGB for name in self._cameras} | {"language": specs.LANGUAGE}
+        return spec | ({"state": specs.STATE_EEF_POS_AA_GRIP} if self._send_state else {})
 
     def get_hold_action(self, last_action: dict[str, Any] | None) -> dict[str, Any]:
         """Return the action of a real-time tick without an answer: no motion, and the last gripper command."""
@@ -257,10 +250,6 @@ class MEMOBench(StepBenchmark):
         # At first the gripper opens.
         hold[-1] = -1.0 if last_action is None else _actions(last_action)[-1, -1]
         return {"actions": hold}
-
-    def render(self) -> NDArray[np.uint8]:
-        """Return both cameras under instruction and checkpoints."""
-        return self._running().render()
 
     def _running(self) -> MemobenchEnv:
         if self._env is None:

@@ -26,7 +26,7 @@ from lerobot_memobench.jobs.processes import locked
 from tests.support import logs, synthetic_dataset
 from tests.support.fake_loop import STOVE
 from tests.support.fork_server import Fork, ForkServer
-from tests.support.object_dataset import make_object_dataset
+from tests.support.synthetic_dataset import make_object_dataset
 
 COMMANDS = {"lerobot": "lerobot_memobench.cli.lerobot", "memobench": "lerobot_memobench.cli.memobench"}
 

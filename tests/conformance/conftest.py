@@ -33,7 +33,6 @@ def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def traces(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Install the example of a memory."""
     install(MEMORY, tmp_path_factory.mktemp("memory_site"))
 
 

@@ -17,7 +17,6 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.conformance.checks import (
     CHECKS,
     FAILED,
-    NO_MEMORY,
     NOT_CHECKED,
     PASSED,
     Behaviour,
@@ -33,6 +32,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import Histories
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.tasks.catalogue import get_task
+from tests.support.lerobot_policies import words_of
 
 EXAMPLE = ("policy=window", "policy.width=32", "policy.frames=8", "policy.stride=2")
 MEM = (
@@ -108,20 +108,6 @@ def test_memory_conforms_on_holds_and_a_deaf_one_does_not(
     found = Behaviour(subject)
     for check in ("reads the prompt", "same history in training"):
         assert run_check(check, found).outcome is FAILED, check
-
-
-def test_a_policy_without_memory_has_none_on_holds(strict: Path, tmp_path: Path) -> None:
-    """A stalled hand continues its chunk; replayed hands do not follow the actions, so none is stalled."""
-    words = [word for word in MEM if "memory" not in word or word == "policy=memobench_mem"]
-    subject = load_subject([*words, "policy.memory=none", f"dataset={strict}"], tmp_path)
-    found = Behaviour(subject)
-    outcomes = {check: run_check(check, found).outcome for check in ON_HOLDS}
-    assert outcomes == {
-        "remembers": FAILED,
-        "reads the prompt": NO_MEMORY,
-        "plans after the prompt": PASSED,
-        "same history in training": PASSED,
-    }
 
 
 # --- a policy with one flaw ---
@@ -251,18 +237,12 @@ def test_errors_of_the_policy_fail_checks(window: Subject, monkeypatch: pytest.M
 
 # --- on images of the real size: LeRobot's policies, ours, the example ---
 
-ACT = (
-    *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
-    *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
-    *("policy.chunk_size=4", "policy.latent_dim=8"),
-)
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "wrong"),
     [
-        (ACT, ["remembers"]),
+        (words_of("act"), ["remembers"]),
         (("policy=memobench_strict",), []),
         (("policy=memobench_strict_memoryless",), ["remembers"]),
     ],
@@ -286,7 +266,6 @@ def test_command_lists_every_check(example: Path, objects: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["policy=windo"], "'window'"),
         (["policy=window", "tasks=all"], "'tasks'"),
         (["policy=window", "policy.widht=3"], "'policy.width'"),
         ([], "policy"),
@@ -307,7 +286,6 @@ def test_memory_of_another_package_runs_an_episode(traces: None) -> None:
     config = MemobenchMemConfig(device="cpu", size="tiny", memory="traces")
     assert config.memory_settings == {"traces": 4}
     memory = MemoryPI05(config).memory
-    assert memory is not None
     state = memory.init(2)
     for step in range(5):
         frames = torch.randn(2, memory.spec.tokens, memory.spec.dim, dtype=torch.bfloat16)

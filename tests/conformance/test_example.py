@@ -15,7 +15,7 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.checks import PASSED, run_checks
 from lerobot_memobench.conformance.subject import load_subject
 from tests.conformance.conftest import EXAMPLE
-from tests.support.lerobots_trainer import trainer_in_this_process
+from tests.support.lerobot_policies import trainer_in_this_process
 from tests.test_docs import commands
 
 ROOT = Path(__file__).parents[2]

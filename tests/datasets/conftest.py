@@ -134,7 +134,6 @@ def demos(make_demo: MakeDemo, make_task: MakeTask) -> list[Demonstration]:
 
 @pytest.fixture(scope="session")
 def synthetic(demos: list[Demonstration], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Dataset of `demos`."""
     return write_dataset(demos, tmp_path_factory.mktemp("synthetic") / "ds", repo_id="local/test")
 
 
@@ -147,7 +146,6 @@ def shown() -> list[Demonstration]:
 
 @pytest.fixture(scope="session")
 def simulated(shown: list[Demonstration], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Dataset of `shown`."""
     return write_dataset(shown, tmp_path_factory.mktemp("simulated") / "ds")
 
 
@@ -159,5 +157,4 @@ def stove() -> Demonstration:
 
 @pytest.fixture
 def copy(tmp_path: Path) -> Callable[[Path], Path]:
-    """Return a function that copies a dataset to a new folder."""
     return lambda folder: Path(shutil.copytree(folder, tmp_path / "copies" / f"{len(list(tmp_path.glob('*/*')))}"))

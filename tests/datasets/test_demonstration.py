@@ -11,10 +11,6 @@ from lerobot_memobench.datasets.demonstration import digest, key_frames, labels,
 from lerobot_memobench.errors import MemobenchError
 
 
-def bits(values) -> str:
-    return "".join(str(int(v)) for v in values)
-
-
 def test_texts(make_demo):
     found = labels(make_demo(["01000", "00100", "00010"]))
     assert found["subgoal.intermediate"] == ["did thing 0"] * 2 + ["did thing 1"] + ["did thing 2"] * 2
@@ -23,15 +19,6 @@ def test_texts(make_demo):
     assert found["checkpoint.operation"].tolist() == [0, 0, 1, 2, -1], "none is left"
     done = ["did thing 0", "did thing 0; did thing 1", "did thing 0; did thing 1; did thing 2"]
     assert found["oracle_memory"] == ["", "", *done]
-
-
-def test_prompt_frames(make_demo):
-    demo = make_demo(["000001", "000000"], exec_start=3)
-    found = labels(demo)
-    assert bits(found["observation.phase"]) == "000111"
-    assert found["observation.step"].tolist() == [0, 1, 2, 0, 1, 2]
-    assert set(found["oracle_memory"]) == {""}
-    assert key_frames(demo).tolist() == [5, -1]  # frames of the episode, prompt included
 
 
 def test_number_of_checkpoints(make_demo, make_task):

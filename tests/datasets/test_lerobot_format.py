@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from huggingface_hub import DatasetCard
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_memobench.constants import CLOCK, LIBERO
 from lerobot_memobench.datasets.demonstration import digest, labels
@@ -54,28 +52,10 @@ def test_frames_are_equal_after_loading(dataset, demos):
         position += len(demo)
 
 
-def test_every_number_has_a_name(dataset):
-    for name, feature in dataset.features.items():
-        if feature["dtype"] not in ("string", "language") and name not in DEFAULT_FEATURES:
-            width = 3 if feature["dtype"] == "video" else feature["shape"][0]
-            assert len(set(feature["names"])) == width, name
-
-
 def test_instructions_are_in_the_present_tense(stove):
     columns = labels(stove)
     assert set(columns["subgoal.instruction"]) == {"switch the stove on", "switch the stove off again"}
     assert "switched the stove on" in columns["subgoal.intermediate"]
-
-
-def test_batches_of_lerobot(dataset):
-    from lerobot.utils.collate import lerobot_collate_fn
-
-    loader = torch.utils.data.DataLoader(dataset, batch_size=4, shuffle=True, collate_fn=lerobot_collate_fn)
-    batch = next(iter(loader))
-    for name in ("subgoal.intermediate", "subgoal.fine", "subgoal.coarse", "oracle_memory", "task"):
-        assert all(isinstance(text, str) for text in batch[name])
-    assert (batch["checkpoint.completed"].shape, batch["checkpoint.completed"].dtype) == ((4, 6), torch.bool)
-    assert all(batch[name].shape == (4,) and batch[name].dtype == torch.float32 for name in CLOCK)
 
 
 def test_statistics(dataset, demos):

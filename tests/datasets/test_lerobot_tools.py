@@ -46,7 +46,6 @@ def validate(folder: Path) -> list[CheckResult]:
 
 
 def edit(root: Path | None, out: Path, operation: Any) -> Path:
-    """Run ``lerobot-edit-dataset``."""
     where = {"new_root": str(out), "new_repo_id": "local/edited"}
     source = {} if root is None else {"repo_id": REPO, "root": str(root)}
     tool.edit_dataset(tool.EditDatasetConfig(operation=operation, **source, **where))
@@ -140,7 +139,6 @@ def test_episodes_of_other_programs(ours, make_demo, tmp_path):
 
 
 def _rewrite(folder: Path, old: str, new: str) -> None:
-    """Replace a text in the records of frames."""
     for path in (folder / "data").rglob("*.parquet"):
         table = pq.read_table(path)
         texts = [text.replace(old, new) for text in table.column(EPISODE_INFO).to_pylist()]

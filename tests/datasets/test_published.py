@@ -33,8 +33,8 @@ def drawer() -> Demonstration:
     demo = drawn_steps(DRAWER, 10_000, 20)
     sim = Simulation(demo.task)
     states = demo.states.copy()
-    joint = joints_of(sim.model)["wooden_cabinet_1_middle_level"]
-    states[:, joint.position] = np.interp(range(20), [2, OPENED, SHUT - 1, SHUT], [-0.01, -0.15, -0.02, 0.006])[:, None]
+    _, columns = joints_of(sim.model)["wooden_cabinet_1_middle_level"]
+    states[:, columns[0]] = np.interp(range(20), [2, OPENED, SHUT - 1, SHUT], [-0.01, -0.15, -0.02, 0.006])
     look, proprio, objects = ObjectSlots(sim), [], []
     for state in states:
         sim.set_state(state, demo.fixture_poses)
@@ -46,7 +46,6 @@ def drawer() -> Demonstration:
 
 
 def grey(demo: Demonstration) -> Demonstration:
-    """Return a demonstration with grey images."""
     image = np.full((len(demo), 16, 16, 3), 128, np.uint8)
     return replace(demo, images={"image": image, "wrist_image": image})
 

@@ -16,7 +16,7 @@ import pytest
 from lerobot_memobench.constants import NO_CLOCK
 from lerobot_memobench.datasets.demonstration import Demonstration, digest, key_frames, labels
 from lerobot_memobench.datasets.episodes import read_episode
-from lerobot_memobench.datasets.record import HOLD_FRAMES
+from lerobot_memobench.datasets.generate import HOLD_FRAMES
 from lerobot_memobench.datasets.validate import replay
 from lerobot_memobench.datasets.write import write_dataset
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS
@@ -115,7 +115,7 @@ RECORD = """
 import json
 import sys
 from pathlib import Path
-from lerobot_memobench.datasets.record import RecordingJob, RecordingSettings
+from lerobot_memobench.datasets.generate import RecordingJob, RecordingSettings
 from lerobot_memobench.tasks.catalogue import get_task
 
 task, seed, settings, folder = sys.argv[1:]

@@ -22,8 +22,7 @@ from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, difference
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.video import BAND
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import headline, read_runs
 from tests.support.logs import protocol_of
 
 STOVE = "turn_on_the_stove_and_turn_it_off"

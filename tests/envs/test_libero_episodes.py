@@ -21,12 +21,11 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.simulation import Simulation
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.libero_suites import initial_states, libero_tasks
+from lerobot_memobench.tasks.catalogue import get_task, initial_states, task_names
 from tests.support.libero import record
 
 STOVE = "turn_on_the_stove"
-NUMBER = libero_tasks("libero_goal").index(STOVE)
+NUMBER = task_names(suite="libero_goal").index(STOVE)
 NOTHING = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
 

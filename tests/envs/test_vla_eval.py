@@ -26,7 +26,7 @@ from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.metrics import report_values, summary_of
 from lerobot_memobench.vla_eval import MEMOBench
-from tests.support.remote_case import free_port
+from tests.support.policy_server import free_port
 from tests.support.vla_eval_server import DigestServer
 
 ROOT = Path(__file__).parents[2]

@@ -15,9 +15,8 @@ from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html import write_html
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import headline, read_runs
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.tasks.catalogue import get_task, task_names

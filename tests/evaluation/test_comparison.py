@@ -11,9 +11,10 @@ import pytest
 
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.comparison import Comparison, Contrast, compare_evaluations, comparison_report
+from lerobot_memobench.evaluation.comparison import Comparison, compare_evaluations, comparison_report
 from lerobot_memobench.evaluation.metrics import METRICS, rollout_value
 from lerobot_memobench.evaluation.records import read_runs, unlike
+from lerobot_memobench.evaluation.statistics import Contrast
 from lerobot_memobench.evaluation.tables import to_markdown
 from tests.support import logs
 

@@ -10,8 +10,8 @@ import pytest
 
 from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.controls import oracle_share
 from lerobot_memobench.evaluation.report import with_labels_of
+from lerobot_memobench.evaluation.statistics import oracle_share
 from tests.support.logs import rollout, write_log
 
 STOVE = "turn_on_the_stove_and_turn_it_off_then_put_the_frying_pan_on_it"

@@ -71,7 +71,7 @@ class Bench:
     def rerun(self) -> None:
         """All that `memobench rerun` does with a card before and after the run."""
         card, settings = again.read_repeatable(self.run)
-        again.check_policy(card, settings.policy_path)
+        again.check_policy(card, settings.policy.get("path"))
         again.differences_here(card)
 
     def use(self, rng: random.Random) -> object:

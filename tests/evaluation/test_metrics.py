@@ -17,8 +17,8 @@ from lerobot_memobench.evaluation.metrics import (
     summary_of,
     wilson,
 )
+from lerobot_memobench.tasks.assessment import FAILURES, asks_order, classify, classify_failure
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.failures import FAILURES, asks_order, classify, classify_failure
 from tests.support.logs import record
 
 

@@ -12,12 +12,12 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.html import write_html
-from lerobot_memobench.evaluation.records import read_run, read_runs, sweeps
+from lerobot_memobench.evaluation.records import headline, read_run, read_runs, sweeps
 from lerobot_memobench.evaluation.report import evaluation_report, write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge
+from lerobot_memobench.tasks.catalogue import task_names
 from tests.support import logs
 from tests.support.logs import SETTINGS, evaluation, facts, write_log
 
@@ -135,3 +135,11 @@ def test_suites_are_not_mixed(tmp_path: Path) -> None:
     (run,) = read_runs([other])
     assert ["strict suite" in headline(read_runs([folder])) for folder in (other, plain)] == [True, False]
     assert any("cork__3" in note for note in run.notes)
+
+
+def test_suites_of_libero_are_joined_whatever_their_seeds(tmp_path: Path) -> None:
+    for seed, suite in enumerate(("libero_spatial", "libero_goal")):
+        own = {"memory_type": suite, "suite": suite, "seed_base": 7}
+        write_log(tmp_path / suite, [record(task_names(suite=suite)[0], marks=[], **own)], type="act", seed=seed)
+    (run,) = read_runs([tmp_path])
+    assert (run.method, [*run.summary.memory_types]) == ("act", ["libero_spatial", "libero_goal"])

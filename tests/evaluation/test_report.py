@@ -20,15 +20,22 @@ from lerobot_memobench.cli.memobench import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episodes, write_episodes
 from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import report_values
 from lerobot_memobench.evaluation.plots import OUTCOMES, bars, draw_figures, draw_replan, success_by_gap
-from lerobot_memobench.evaluation.records import Run, read_runs
+from lerobot_memobench.evaluation.records import Run, headline, read_runs
 from lerobot_memobench.evaluation.report import best_interval, evaluation_report, write_report
-from lerobot_memobench.evaluation.tables import WRITERS, Name, Report, Section, Table, csv_tables, csv_text, to_markdown
-from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES
-from lerobot_memobench.tasks.gap import gaps, longest_gap
+from lerobot_memobench.evaluation.tables import (
+    WRITERS,
+    Name,
+    Report,
+    Section,
+    Table,
+    csv_tables,
+    csv_text,
+    to_markdown,
+)
+from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES
+from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, longest_cue_to_use, task_names
 from lerobot_memobench.tasks.task import STRICT_FAILURES
 from tests.support import logs
 from tests.support.logs import rollout, write_log
@@ -284,7 +291,7 @@ def test_the_nearest_log_is_suggested(tmp_path: Path) -> None:
             read_episodes(wrong)
 
 
-# --- gaps ---
+# --- steps from cue to use ---
 
 COUNTING = "turn_the_stove_on_and_off_a_given_number_of_times"
 HIDING = "find_the_tomato_hidden_in_one_of_the_drawers"
@@ -293,13 +300,13 @@ HIDING = "find_the_tomato_hidden_in_one_of_the_drawers"
 @pytest.mark.parametrize("suite", ["published", "strict"])
 def test_every_checkpoint_of_the_catalogue_was_measured(suite: str) -> None:
     for task in map(get_task, task_names(suite=suite)):
-        found = gaps(task)
-        assert len(found) == len(task.checkpoints)
-        assert all(gap is None or 0 < gap.least <= gap.median <= gap.most for gap in found)
+        measured = cue_to_use(task)
+        assert len(measured) == len(task.checkpoints)
+        assert all(one is None or 0 < one.least <= one.median <= one.most for one in measured)
         # An instruction needs no memory, a prompt does.
-        assert (found[0] is None) == (task.prompt is None)
+        assert (measured[0] is None) == (task.prompt is None)
         if suite == "strict":
-            longest = longest_gap(task)
+            longest = longest_cue_to_use(task)
             assert longest.median > 30
             assert longest.held == (task.prompt is not None)
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import EXECUTION, HORIZON
-from lerobot_memobench.datasets.record import HOLD_FRAMES, RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.generate import HOLD_FRAMES, RecordingSettings, compiled_episode, record
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.experts.expert import Expert

@@ -12,8 +12,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import processes
-from lerobot_memobench.jobs.processes import Advance, locked
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, locked, run_jobs
 from tests.support.note_job import Killed, Note
 
 

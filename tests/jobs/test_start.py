@@ -14,7 +14,7 @@ import pytest
 from lerobot_memobench import io
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, choose_caches, private_folder
-from lerobot_memobench.jobs import start
+from lerobot_memobench.jobs import processes
 
 COMMAND = """
 import sys
@@ -57,7 +57,7 @@ def test_a_reader_may_leave(call: str, unbuffered: str) -> None:
 
 
 SOCKET = """[
-    __import__("lerobot_memobench.jobs.start").jobs.start.prepare_process(),
+    __import__("lerobot_memobench.jobs.processes").jobs.processes.prepare_process(),
     __import__("multiprocessing.connection").connection.Listener(family="AF_UNIX"),
     open(__import__("tempfile").mkstemp()[1], "w").close(),
 ][2]"""
@@ -76,11 +76,11 @@ def test_sockets_fit_into_a_long_temporary_folder(tmp_path: Path) -> None:
 @linux
 def test_a_long_temporary_folder_without_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 73)
-    monkeypatch.setattr(start, "SHORT_FOLDERS", (str(tmp_path / "none"),))
+    monkeypatch.setattr(processes, "SHORT_FOLDERS", (str(tmp_path / "none"),))
     with pytest.raises(MemobenchError, match="set TMPDIR"):
-        start.prepare_process()
+        processes.prepare_process()
     monkeypatch.setattr(tempfile, "tempdir", "/" + "a" * 71)
-    start.prepare_process()
+    processes.prepare_process()
 
 
 @linux

@@ -12,18 +12,10 @@ import torch
 from safetensors.torch import save_file
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.detector import Detector, detections
+from lerobot_memobench.perception.detector import Detector, detections, load_detector, save_detector
 from lerobot_memobench.perception.visual_encoder import GRID, SIDE, area_averaged
-from lerobot_memobench.perception.weights import load_detector, save_detector
 from research.detector.training import targets
-from tests.support.labelled_images import (
-    all_outputs,
-    laid_out,
-    perfect,
-    small_encoder,
-    synthetic,
-    trained_a_little,
-)
+from tests.support.labelled_images import all_outputs, laid_out, perfect, small_encoder, synthetic, trained_a_little
 
 KINDS, CELLS = 3, 2 * GRID
 

@@ -8,8 +8,16 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from lerobot_memobench.experts.demonstration_prompt import highlight_of
-from lerobot_memobench.perception.detector import DETECTION, MIN_SCORE, Detector
+from lerobot_memobench.experts.expert import highlight_of
+from lerobot_memobench.perception.detector import (
+    DETECTION,
+    MIN_SCORE,
+    PACKAGE,
+    Detector,
+    load_detector,
+    load_visual_encoder,
+    warn_of_former_scenes,
+)
 from lerobot_memobench.perception.objects import (
     APART,
     FACING,
@@ -18,14 +26,7 @@ from lerobot_memobench.perception.objects import (
     PARTS,
     SAME,
     ObjectLocalizer,
-    projected,
     views_of,
-)
-from lerobot_memobench.perception.weights import (
-    PACKAGE,
-    load_detector,
-    load_visual_encoder,
-    warn_of_former_scenes,
 )
 from lerobot_memobench.policies.memobench_mem.objects import in_order
 from lerobot_memobench.sim.asset import TABLE_TOP, split_class
@@ -33,7 +34,7 @@ from lerobot_memobench.sim.object_layout import SIZE, SLOTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from research.detector.labels import Labeller, Rows, kinds
+from research.detector.labels import Labeller, Rows, kinds, projected
 from research.detector.randomisation import reach, settle
 from tests.support.labelled_images import BOWLS, DRAWERS, simulation, small_encoder
 
@@ -49,7 +50,6 @@ def localizer() -> ObjectLocalizer:
 
 
 def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
-    """Return the detections of a detector without errors."""
     things = row["things"][: row["count"]]
     detected = np.zeros(len(things), DETECTION)
     place, depth = projected(things["position"].astype(float), row)
@@ -60,7 +60,6 @@ def perfect(row: Rows, score: float = 1.0) -> NDArray[np.void]:
 
 
 def bent(sim: Simulation) -> Simulation:
-    """Bend the arm to another place."""
     here, turned = sim.eef_pose()
     assert reach(sim, here + np.array([0.1, -0.08, -0.1]), turned)
     settle(sim)

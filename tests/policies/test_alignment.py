@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +41,6 @@ def test_semantic() -> None:
     memory, mask = _inputs()
     text = torch.randn(B, T)
     module = make_alignment("semantic", D, T, P)
-    assert module is not None
     z = _pooled(module, memory, mask)
     expected = np.mean([1 - z[b] @ _unit(text[b].numpy()) for b in range(B)])
     assert module(memory, mask, text).item() == pytest.approx(expected, abs=1e-5)
@@ -53,7 +51,6 @@ def test_contrastive_counts_repeated_subgoals_as_positives() -> None:
     text = torch.randn(B, T)
     text[3] = 2.5 * text[0]  # the same direction is the same text
     module = make_alignment("contrastive", D, T, P)
-    assert module is not None
     assert module.log_temperature.exp().item() == pytest.approx(0.07)
     module.log_temperature.data.fill_(math.log(0.3))
     z = _pooled(module, memory, mask)
@@ -76,7 +73,6 @@ def test_framewise() -> None:
     text_mask[0, 1] = False
     text[0, 1] = float("nan")  # the embedding of a frame without text
     module = make_alignment("framewise", D, T, P)
-    assert module is not None
     weight, bias = module.project.weight.detach().numpy(), module.project.bias.detach().numpy()
     above = below = 0.0
     for b in range(B):
@@ -111,7 +107,6 @@ def test_retrieval_accuracy() -> None:
     [
         ("semantic", "coarse", "subgoal.coarse"),
         ("framewise", "intermediate", "subgoal.intermediate"),
-        ("semantic", "fine", "subgoal.fine"),
     ],
 )
 def test_subgoal_level_chooses_the_column(root: Path, align: str, level: str, column: str) -> None:
@@ -154,16 +149,6 @@ def test_one_subgoal_cannot_be_shuffled() -> None:
     config = MemobenchMemConfig(align="semantic", subgoal_level="coarse", align_targets="shuffled")
     with pytest.raises(MemobenchError, match="needs at least two"):
         with_targets(table, config, Path("here"))
-
-
-@pytest.mark.parametrize("subgoals", [2, 3, 8])
-def test_shuffled_subgoals_are_not_renamed(subgoals: int) -> None:
-    """A subgoal is one frame of each of 60 episodes."""
-    texts = [str(number) for number in range(subgoals)] * 60
-    found = shuffled(texts, np.arange(0, len(texts) + 1, subgoals))
-    for text in {*texts}:
-        taken = Counter(other for own, other in zip(texts, found, strict=True) if own == text)
-        assert max(taken.values()) < 0.75 * taken.total()
 
 
 TWO_DRAWERS = ["open the top drawer", "put the pea on the table", "open the low drawer", "", "put the pea on the table"]

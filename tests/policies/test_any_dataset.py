@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ import pytest
 import torch
 from lerobot.common.control_utils import predict_action
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
@@ -22,51 +19,14 @@ from lerobot_memobench.commands.command_line import parse_words, read_words
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemorySpec
 from lerobot_memobench.training import loop
 from lerobot_memobench.training.command import complete_training
+from tests.support.synthetic_dataset import drawn_frame, write_robot
 
-IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
-TASK = "fold the towel"
-
-
-def numbers(rng: np.random.Generator, count: int) -> np.ndarray:
-    return rng.normal(size=count).astype(np.float32)
-
-
-def images(rng: np.random.Generator, cameras: Mapping[str, tuple[int, int]]) -> dict[str, np.ndarray]:
-    return {name: rng.integers(0, 255, (*size, 3), np.uint8) for name, size in cameras.items()}
-
-
-def write(
-    root: Path, cameras: Mapping[str, tuple[int, int]], state: int, action: int, fps: int = 30, **texts: str
-) -> Path:
-    """Write an episode of a robot; ``cameras``: name -> height and width."""
-    image = {"dtype": "image", "names": ["height", "width", "channels"]}
-    dataset = LeRobotDataset.create(
-        "somebody/robot",
-        fps=fps,
-        root=root,
-        use_videos=False,
-        features={
-            STATE: {"dtype": "float32", "shape": (state,), "names": None},
-            ACTION: {"dtype": "float32", "shape": (action,), "names": None},
-            **{name: {**image, "shape": (*size, 3)} for name, size in cameras.items()},
-            **{name: {"dtype": "string", "shape": (1,), "names": None} for name in texts},
-        },
-    )
-    rng = np.random.default_rng(0)
-    for _ in range(8):
-        frame = {STATE: numbers(rng, state), ACTION: numbers(rng, action), "task": TASK}
-        dataset.add_frame(frame | images(rng, cameras) | texts)
-    dataset.save_episode()
-    dataset.finalize()
-    return root
+IMAGES, STATE = "observation.images.", "observation.state"
 
 
 def train(root: Path, out: Path, *flags: str, size: str = "tiny") -> Path:
-    """Train two updates; return the checkpoint."""
     own = ["--policy.type=memobench_mem", f"--policy.size={size}", "--policy.memory_settings={frames: 4}"]
     usual = [
         *("--dataset.repo_id=somebody/robot", f"--dataset.root={root}", f"--output_dir={out}"),
@@ -93,15 +53,15 @@ THREE = dict.fromkeys((IMAGES + name for name in ("left", "top", "gripper")), (9
 def test_datasets_of_other_robots(
     cameras: dict[str, tuple[int, int]], state: int, action: int, fps: int, size: str, tmp_path: Path
 ) -> None:
-    checkpoint = train(write(tmp_path / "data", cameras, state, action, fps), tmp_path / "run", size=size)
+    checkpoint = train(write_robot(tmp_path / "data", cameras, state, action, fps), tmp_path / "run", size=size)
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     policy: Any = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
     before, after = make_pre_post_processors(config, pretrained_path=str(checkpoint))
     rng, cpu = np.random.default_rng(1), torch.device("cpu")
     policy.reset()
     for _ in range(5):
-        seen = {STATE: numbers(rng, state), **images(rng, cameras)}
-        found = predict_action(seen, policy, cpu, before, after, False, TASK, "arm")
+        seen = drawn_frame(rng, cameras, **{STATE: state})
+        found = predict_action(seen, policy, cpu, before, after, False, "fold the towel", "arm")
         assert found.shape == (1, action)
         assert found.isfinite().all()
     assert config.memory_camera == next(iter(cameras))
@@ -137,7 +97,7 @@ def test_memory_camera_is_an_input() -> None:
 def test_missing_texts_are_refused_before_the_model_is_built(
     extra: dict[str, str], flag: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = write(tmp_path / "data", {IMAGES + "top": (96, 96)}, 6, 6, **extra)
+    root = write_robot(tmp_path / "data", {IMAGES + "top": (96, 96)}, 6, 6, **extra)
     monkeypatch.setattr(modeling_memobench_mem, "MemoryPI05", None)
     with pytest.raises(MemobenchError, match=named):
         train(root, tmp_path / "run", f"--policy.{flag}")
@@ -154,34 +114,13 @@ def test_states_longer_than_the_base_weights_are_refused() -> None:
         config.validate_features()
 
 
-# --- robots without episodes ---
-
-
-def test_history_without_reset_is_bounded(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert FrameSampling.capacity == 8192
-    monkeypatch.setattr(FrameSampling, "capacity", 16)
-    spec = MemorySpec(dim=2, tokens=1, width=2, expert=2, grid=0, stride=1)
-    mechanism = FrameSampling(spec, torch.nn.Identity(), FrameSampling.Settings(frames=4))
-    state = mechanism.init(1)
-    with caplog.at_level(logging.WARNING):
-        for step in range(50):
-            state = mechanism.observe(state, torch.full((1, 1, 2), float(step)), torch.tensor([step]))
-            read = mechanism.read(state)
-            assert read.steps is not None
-            assert read.steps[read.mask].tolist() == list(mechanism.slots(step, mechanism.settings)), "as in training"
-    assert [frame.step for frame in state[0]] == list(range(34, 50))
-    assert read.steps.tolist() == [[34, 39, 44, 49]]
-    assert len(caplog.messages) == 1
-    assert "policy.reset()" in caplog.text
-
-
 # --- the benchmark between updates ---
 
 
 def test_evaluation_between_updates_needs_the_datasets_inputs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root = write(tmp_path / "data", {IMAGES + "image": (128, 128)}, 8, 7)
+    root = write_robot(tmp_path / "data", {IMAGES + "image": (128, 128)}, 8, 7)
     words = ("policy=act", "policy.pretrained_backbone_weights=null", "env=memobench", "steps=1", "device=cpu")
     assert main(["train", *words, f"dataset={root}", f"output_dir={tmp_path / 'run'}"]) == 2
     assert re.search(f"{root}.*128 x 128", capsys.readouterr().err)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.baselines import (
     MemobenchBlindConfig,
@@ -19,24 +19,13 @@ from lerobot_memobench.policies.baselines import (
 OFFERED = {"memobench_expert": "expert_action", "memobench_blind": "blind_action"}
 
 
-class _EnvConfig:
-    """The fields of an environment's configuration that make_policy reads."""
-
-    features = {
-        "pixels/image": PolicyFeature(type=FeatureType.VISUAL, shape=(256, 256, 3)),
-        "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
-        "action": PolicyFeature(type=FeatureType.ACTION, shape=(7,)),
-    }
-    features_map = {"pixels/image": "observation.images.image", "agent_pos": "observation.state", "action": "action"}
-
-
 def observation(rows: int) -> dict[str, object]:
     return {"observation.state": torch.zeros(rows, 8), "task": ["a"] * rows}
 
 
 @pytest.mark.parametrize("config", [MemobenchExpertConfig(), MemobenchBlindConfig(), MemobenchRandomConfig()])
 def test_lerobots_factories_make_it(config: UntrainedConfig) -> None:
-    policy = make_policy(config, env_cfg=_EnvConfig())  # type: ignore[arg-type]
+    policy = make_policy(config, env_cfg=MemobenchEnvConfig())
     before, after = make_pre_post_processors(config)
     assert isinstance(policy, get_policy_class(config.type))
     assert not list(policy.parameters())
@@ -72,14 +61,3 @@ def test_random_actions_are_uniform_and_repeatable() -> None:
     assert torch.equal(first, draws(5, seed=3))
     assert not torch.equal(first, draws(5, seed=4))
     assert not torch.equal(first[:, 0], first[:, 1])
-
-
-def test_random_rollouts_differ_and_smoothing_is_forgotten() -> None:
-    policy = get_policy_class("memobench_random")(MemobenchRandomConfig(smoothing=0.9))
-    first = policy.select_action(observation(2))
-    policy.reset()
-    assert not torch.equal(first, policy.select_action(observation(2)))
-    rough, smooth = draws(400), draws(400, smoothing=0.9)
-    assert torch.equal(rough[0], smooth[0])
-    assert torch.allclose(smooth[1], 0.9 * smooth[0] + 0.1 * rough[1])
-    assert smooth.diff(dim=0).abs().mean() < 0.2 * rough.diff(dim=0).abs().mean()

@@ -20,8 +20,7 @@ from lerobot_memobench.commands.command_line import parse_words
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.compatibility import chosen_convention
-from lerobot_memobench.rollouts.plan import plan_line, with_names
-from lerobot_memobench.rollouts.settings import read_settings
+from lerobot_memobench.rollouts.plan import plan_line, read_settings, with_names
 from lerobot_memobench.sim.convention import CONVENTIONS
 from tests.support.fake_loop import make_checkpoint
 
@@ -121,8 +120,6 @@ def test_a_rename_map_does_not_hide_the_convention(tmp_path: Path) -> None:
         for words in ([], ["convention=libero"]):
             with pytest.raises(MemobenchError, match="found upright in rename_map, which does not mirror images"):
                 plan_line([*line, f"rename_map={json.dumps(renamed)}", *words])
-    with pytest.raises(MemobenchError, match="did you mean 'libero'"):
-        plan_line([*line, "convention=liberu"])
     ours = saved(tmp_path / "ours", OURS)
     back = json.dumps({"observation.images.image2": "observation.images.wrist_image"})
     with pytest.raises(MemobenchError, match="expects images of convention=upright"):
@@ -180,11 +177,8 @@ def test_camera_name_mapping_of_a_command(tmp_path: Path) -> None:
     ours = saved(tmp_path / "ours", OURS)
     with pytest.raises(MemobenchError, match=r"expects images of convention=upright.*, and found libero"):
         plan_line([*line[:3], f"policy={ours}", mapping])
-    for bad in ("camera1", "[camera1]", "{"):
-        with pytest.raises(MemobenchError, match="expected a mapping"):
-            plan_line([*line, f"camera_name_mapping={bad}"])
-    with pytest.raises(MemobenchError, match=r"camera_name_mapping is .*; expected different names"):
-        plan_line([*line, 'camera_name_mapping={"agentview": "camera1"}'])
+    with pytest.raises(MemobenchError, match="expected a mapping"):
+        plan_line([*line, "camera_name_mapping=[camera1]"])
 
 
 def test_lerobots_own_command_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,7 +231,6 @@ def test_lerobots_commands_evaluate_with_the_plans_of_their_policies(
 
 
 def _shown(suites: Any) -> set[str]:
-    """Return the names of the images that environments show."""
     ((env,),) = (suite.values() for suite in suites.values())
     return {*env.single_observation_space["pixels"]}
 

@@ -34,7 +34,6 @@ def made(std: float = 0.5, **changed: Any) -> FastWeights:
 
 
 def normed(x: Tensor, norm: torch.nn.LayerNorm) -> Tensor:
-    """Return the layer norm of a vector (D,)."""
     return (x - x.mean()) / (x.var(unbiased=False) + 1e-6).sqrt() * norm.weight + norm.bias
 
 
@@ -42,7 +41,7 @@ def written(
     mechanism: FastWeights, weights: list[tuple[Tensor, Tensor]], frame: Tensor, step: int
 ) -> tuple[list[tuple[Tensor, Tensor]], Tensor, list[float]]:
     """Return weights and biases of the heads after a frame (P, D), its outputs, and how long the steps were."""
-    encoded = mechanism.encoder(frame[None, None], torch.tensor([[step]]))[0, 0]
+    encoded = mechanism.encoder(frame[None], torch.tensor([step]))[0]
     rates = softplus(encoded @ mechanism.rate.weight.T + mechanism.rate.bias).clamp(max=MAX_RATE)
     after, outputs, lengths = [], [], []
     for head, (weight, bias) in enumerate(weights):
@@ -64,7 +63,6 @@ def written(
             rates[token, head].detach() * (rms(key @ weight + bias) - (value - key)).square().sum() / 2
             for token, (key, value) in enumerate(zip(keys, values, strict=True))
         )
-        assert isinstance(loss, Tensor)
         moved = []
         for old, gradient in zip((weight, bias), torch.autograd.grad(loss, (weight, bias)), strict=True):
             lengths.append(float(gradient.norm()))
@@ -98,7 +96,6 @@ def test_weights_equal_their_formula(std: float) -> None:
             torch.testing.assert_close(state["bias"][row, head, 0], bias, rtol=1e-5, atol=1e-5)
         expected = mechanism.out(torch.cat(outputs[-FRAMES_READ:]))
         torch.testing.assert_close(read.each[row], expected, rtol=1e-5, atol=1e-5)
-    assert read.steps is not None
     assert read.steps[0].tolist() == [16 * frame for frame in range(2, count) for _ in range(3)]
     assert (shortened > 0) == (std > 1)
 
@@ -119,7 +116,6 @@ RECURRENT_SPEC = MemorySpec(dim=32, tokens=3, width=32, expert=16, grid=0, strid
 
 
 def made_recurrent(**changed: Any) -> recurrent.Recurrent:
-    """Build a mechanism in float64 with large weights."""
     torch.manual_seed(0)
     mechanism = recurrent.Recurrent(
         RECURRENT_SPEC, torch.nn.Identity(), mechanism_settings("recurrent", changed)
@@ -142,7 +138,7 @@ def turned(x: Tensor, place: int) -> Tensor:
 
 def slots_after(mechanism: recurrent.Recurrent, slots: list[Tensor], frame: Tensor, step: int) -> list[Tensor]:
     """Return the slots after a frame (P, D), by the formula, a slot and a head at a time."""
-    encoded = mechanism.encoder(frame[None, None], torch.tensor([[step]]))[0, 0]
+    encoded = mechanism.encoder(frame[None], torch.tensor([step]))[0]
     both = [normed(token, mechanism.pre_norm) for token in [*encoded, *slots]]
     of_key, of_value = mechanism.key_value.weight.chunk(2)
     keys = [turned(of_key @ token, place) for place, token in enumerate(both)]

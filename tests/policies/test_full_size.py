@@ -39,7 +39,6 @@ def _batch(config: MemobenchMemConfig) -> dict[str, Tensor]:
     """Return one preprocessed training sample with a full memory."""
     torch.manual_seed(1)
     length = config.tokenizer_max_length
-    assert length is not None
     return {
         CAMERA: torch.rand(1, 3, *config.image_size),
         "observation.state": torch.rand(1, 8),

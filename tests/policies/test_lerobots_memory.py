@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from lerobot.policies.factory import get_policy_class
 
 from lerobot_memobench.cli.memobench import main as memobench
-from tests.policies.test_looking import FEATURES, STEPS, check, execution
+from tests.policies.test_looking import SIDES, STEPS, check, execution
 from tests.policies.test_other_policies import TASK, _tiny_paligemma, train_and_roll_out  # noqa: F401 - a fixture
+from tests.support.lerobot_policies import make_config
 
 pytestmark = [
     pytest.mark.slow,
@@ -29,9 +31,7 @@ MEMORY = {"memory_frames": FRAMES, "memory_stride": STRIDE, "memory_temporal_att
 
 
 def pi05(**memory: Any) -> Any:
-    from lerobot.policies.pi05.modeling_pi05 import PI05Config, PI05Policy
-
-    return PI05Policy(PI05Config(**FEATURES, **SIZES, **MEMORY, **memory))
+    return get_policy_class("pi05")(make_config("pi05", SIDES, **SIZES, **MEMORY, **memory))
 
 
 def test_training_and_rollout(tmp_path: Path) -> None:

@@ -12,22 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+from lerobot.configs import FeatureType, NormalizationMode
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.streams import write_streams
 from lerobot_memobench.envs.evaluation_file import read_evaluation
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.lerobots_trainer import trainer_in_this_process
-from tests.support.tiny_paligemma import shrink_paligemma
-from tests.support.tiny_smolvlm import tiny_smolvlm
+from tests.support.lerobot_policies import (
+    make_config,
+    save_checkpoint,
+    shrink_paligemma,
+    tiny_smolvlm,
+    trainer_in_this_process,
+)
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 IMAGES = "observation.images."
 RENAMED = {f"{IMAGES}image": f"{IMAGES}camera1", f"{IMAGES}image2": f"{IMAGES}camera2"}
-SMALL = {"chunk_size": 4, "n_action_steps": 4, "device": "cpu", "push_to_hub": False}
+SHORT = {"chunk_size": 4, "n_action_steps": 4}
+LENGTHS = {"observation.state": 8}
+"""Of the benchmark's vectors."""
 
 
 @pytest.fixture(scope="module")
@@ -37,28 +41,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {name: write_streams(folder / name, frames=9, task=TASK, convention=name) for name in ("upright", "libero")}
 
 
-def save(folder: Path, kind: str, cameras: dict[str, int], state: int, **settings: Any) -> Path:
-    """Write a checkpoint of random weights; ``cameras``: name -> side, pixels."""
-    images = {f"{IMAGES}{name}": PolicyFeature(FeatureType.VISUAL, (3, side, side)) for name, side in cameras.items()}
-    inputs = {**images, "observation.state": PolicyFeature(FeatureType.STATE, (state,))}
-    config = make_policy_config(
-        kind,
-        input_features=inputs,
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-        **SMALL,
-        **settings,
-    )
-    torch.manual_seed(0)
-    get_policy_class(kind)(config).save_pretrained(folder)
-    lengths = {"observation.state": 8, "action": 7}
-    stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in lengths.items()}
-    for processor in make_pre_post_processors(config, dataset_stats=stats):
-        processor.save_pretrained(folder)
-    return folder
-
-
 def train(policy: Path, dataset: Path, run: Path, *words: str) -> Path:
-    """Continue training for two updates; return the checkpoint."""
     usual = ("steps=2", "batch_size=2", "num_workers=0", "save_freq=2", "policy.device=cpu")
     with trainer_in_this_process():
         assert main(["train", f"policy={policy}", f"dataset={dataset}", f"output_dir={run}", *usual, *words]) == 0
@@ -91,16 +74,16 @@ def test_pi05(
 ) -> None:
     shrink_paligemma(monkeypatch, get_task(TASK).language)
     both = dict.fromkeys((FeatureType.STATE.value, FeatureType.ACTION.value), NormalizationMode.MEAN_STD)
-    path = save(
-        tmp_path / "pi05_libero_finetuned",
+    config = make_config(
         "pi05",
         {"image": 256, "image2": 256, "empty_camera_0": 224},
-        8,
+        **SHORT,
         empty_cameras=1,
         num_inference_steps=2,
         tokenizer_max_length=64,
         normalization_mapping={FeatureType.VISUAL.value: NormalizationMode.IDENTITY, **both},
     )
+    path = save_checkpoint(tmp_path / "pi05_libero_finetuned", config)
     training = {"dataset": {"repo_id": "HuggingFaceVLA/libero"}, "rename_map": {}}
     (path / "train_config.json").write_text(json.dumps(training))
     check(path, datasets, tmp_path, {}, capsys)
@@ -108,15 +91,16 @@ def test_pi05(
 
 @pytest.mark.slow
 def test_smolvla(datasets: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    base = save(
-        tmp_path / "smolvla_base",
+    config = make_config(
         "smolvla",
         {"camera1": 256, "camera2": 256, "camera3": 256},
-        6,
+        state=6,
+        **SHORT,
         num_vlm_layers=2,
         num_steps=2,
         vlm_model_name=str(tiny_smolvlm(tmp_path, get_task(TASK).language)),
     )
+    base = save_checkpoint(tmp_path / "smolvla_base", config, LENGTHS)
     words = (f"rename_map={json.dumps(RENAMED)}", "policy.empty_cameras=1")
     path = train(base, datasets["libero"], tmp_path / "smolvla_libero", *words)
     training = json.loads((path / "train_config.json").read_text())

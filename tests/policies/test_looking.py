@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
@@ -23,20 +23,12 @@ from lerobot_memobench.policies.baselines import (
     MemobenchRandomPolicy,
 )
 from lerobot_memobench.rollouts.rollout import CHUNKED, ActionQueue, plans_chunks
-from tests.support.policy_server import PolicyServer
-from tests.support.remote_case import counting, make
+from tests.support.lerobot_policies import make_config
+from tests.support.policy_server import PolicyServer, counting, make
 from tests.support.small_policy import made_for_training
 
 CAMERAS = ("observation.images.image", "observation.images.wrist_image")
-IMAGE = PolicyFeature(type=FeatureType.VISUAL, shape=(3, 96, 96))
-FEATURES: dict[str, Any] = {
-    "input_features": {
-        **dict.fromkeys(CAMERAS, IMAGE),
-        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(8,)),
-    },
-    "output_features": {"action": PolicyFeature(type=FeatureType.ACTION, shape=(7,))},
-    "device": "cpu",
-}
+SIDES = {"image": 96, "wrist_image": 96}
 STEPS, PLAN = 10, 3
 Row = tuple[int, int]
 """Control step and phase of an environment."""
@@ -106,12 +98,7 @@ EVERY_PLAN = range(0, STEPS, PLAN)
 
 
 def act(**fields: Any) -> Any:
-    from lerobot.policies.act.configuration_act import ACTConfig
-    from lerobot.policies.act.modeling_act import ACTPolicy
-
-    small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
-    sizes = {**small, "chunk_size": 4, "n_action_steps": PLAN, "latent_dim": 8, "pretrained_backbone_weights": None}
-    return ACTPolicy(ACTConfig(**{**FEATURES, **sizes, **fields}))
+    return get_policy_class("act")(make_config("act", SIDES, **{"n_action_steps": PLAN} | fields))
 
 
 def test_act() -> None:
@@ -178,10 +165,7 @@ def test_memory_needs_stored_frames_and_plans(dataset_root: Path) -> None:
 
 @pytest.mark.parametrize(
     ("fields", "looked"),
-    [
-        ({"dialect": "openpi", "history_every": 2}, [0, 2, 3, 4, 5, 6, 8, 9]),
-        ({"dialect": "robomme"}, range(STEPS)),
-    ],
+    [({"dialect": "openpi", "history_every": 2}, [0, 2, 3, 4, 5, 6, 8, 9]), ({"dialect": "robomme"}, range(STEPS))],
     ids=["openpi", "robomme"],
 )
 def test_servers_get_needed_observations(fields: dict[str, Any], looked: Sequence[int]) -> None:

@@ -15,16 +15,14 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.commands.lerobot_commands import call_lerobot
+from lerobot_memobench.commands.command_line import call_lerobot
 from lerobot_memobench.conformance.streams import write_streams
-from lerobot_memobench.constants import EXECUTION, PROMPT
+from lerobot_memobench.constants import EXECUTION
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.lerobots_trainer import trainer_in_this_process
+from tests.support.lerobot_policies import shrink_paligemma, tiny_smolvlm, trainer_in_this_process, words_of
 from tests.support.logs import protocol_of
-from tests.support.tiny_paligemma import shrink_paligemma
-from tests.support.tiny_smolvlm import tiny_smolvlm
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 STATE, OBJECTS = "observation.state", "observation.environment_state"
@@ -59,11 +57,6 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     return protocol_of(out / "eval")
 
 
-ACT = (
-    *("policy=act", "policy.pretrained_backbone_weights=null", "policy.dim_model=32", "policy.n_heads=2"),
-    *("policy.dim_feedforward=64", "policy.n_encoder_layers=1", "policy.n_vae_encoder_layers=1"),
-    *("policy.chunk_size=4", "policy.n_action_steps=4", "policy.latent_dim=8"),
-)
 DIFFUSION = (
     *("policy=diffusion", "policy.down_dims=[16,32]", "policy.num_inference_steps=2", "policy.horizon=8"),
     *("policy.diffusion_step_embed_dim=16", "policy.n_groups=4", "policy.n_action_steps=2"),
@@ -86,7 +79,7 @@ DEFAULT = (("diffusion", "pixels"), ("act", "both"))
         pytest.param(
             words, *SHOWN[case], marks=() if (name, case) in DEFAULT else pytest.mark.slow, id=f"{name} {case}"
         )
-        for name, words in (("act", ACT), ("diffusion", DIFFUSION))
+        for name, words in (("act", words_of("act")), ("diffusion", DIFFUSION))
         for case in SHOWN
     ],
 )
@@ -143,36 +136,11 @@ PROMPTS = [136, 144]
 HORIZON, INTERVAL = 20, 8
 
 
-@pytest.fixture
-def observed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Run two episodes in one batch by LeRobot's command; return each step's phases and steps of both rows."""
-    import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
-
-    def run(policy: type, *flags: str) -> list[tuple[list[int], list[int]]]:
-        clocks, select = [], policy.select_action  # type: ignore[attr-defined]
-
-        def selected(this: Any, batch: Any, **options: Any) -> Any:
-            phases, steps = (batch[f"observation.{name}"].flatten().int().tolist() for name in ("phase", "step"))
-            clocks.append((phases, steps))
-            return select(this, batch, **options)
-
-        monkeypatch.setattr(policy, "select_action", selected)
-        line = [
-            *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}"),
-            *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
-            *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
-        ]
-        assert call_lerobot("eval", [*line, *flags]) == 0
-        return clocks
-
-    return run
-
-
-def test_first_plan_reads_the_first_execution_frame(
-    observed: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_first_plan_reads_the_first_execution_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The environments receive the planned actions and no earlier ones, whatever the lengths of the prompts."""
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    import lerobot_policy_memobench  # noqa: F401 - as LeRobot finds it
 
     plans: list[np.ndarray] = []
     applied: dict[int, list[np.ndarray]] = defaultdict(list)
@@ -191,21 +159,16 @@ def test_first_plan_reads_the_first_execution_frame(
     monkeypatch.setattr(MemobenchEnv, "step", stepped)
     words = dict(word.split("=", 1) for word in DIFFUSION) | {"policy.horizon": "16", "policy.n_action_steps": "8"}
     flags = [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in words.items()]
-    clocks = observed(DiffusionPolicy, *flags, "--env.prompt_in=reset")
+    line = [
+        *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.prompt_in=reset"),
+        *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
+        *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
+    ]
+    assert call_lerobot("eval", [*line, *flags]) == 0
     records = read_episodes(tmp_path)
     assert [(record["prompt_steps"], record["steps"]) for record in records] == [(steps, HORIZON) for steps in PROMPTS]
     assert [record["prompt_shown"] for record in records] == [True, True]
-    assert clocks[0] == ([EXECUTION] * 2, [0, 0])
     for row, seed in enumerate((7, 8)):
         expected = np.concatenate([actions[row, :INTERVAL].numpy() for actions in plans])[:HORIZON]
         np.testing.assert_array_equal(np.stack(applied[seed]), expected)
     assert protocol_of(tmp_path)["prompt_in"] == "reset"
-
-
-def test_prompts_are_observed_by_policies_that_read_them(observed: Any, tmp_path: Path) -> None:
-    from lerobot_memobench.policies.baselines import MemobenchExpertPolicy
-
-    settings = ("--env.expert_action=true", "--env.horizon=2", "--env.obs_type=environment_state_agent_pos")
-    clocks = observed(MemobenchExpertPolicy, "--policy.type=memobench_expert", *settings)
-    assert [sum(phases[row] == PROMPT for phases, _ in clocks) for row in range(2)] == PROMPTS
-    assert protocol_of(tmp_path)["prompt_in"] == "steps"

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.envs import preprocess_observation
-from lerobot.policies import make_policy, make_pre_post_processors
-from lerobot.policies.factory import get_policy_class
+from lerobot.policies import make_policy
 from lerobot.utils.constants import OBS_IMAGES
 from vla_eval import serve_background
 
@@ -27,23 +26,23 @@ from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies import remote_connection as wire
 from lerobot_memobench.policies.remote import MOST_ACTIONS, RemoteConfig, RemotePolicy, fit
-from tests.support.policy_server import PolicyServer, robomme
-from tests.support.remote_case import (
+from tests.support.policy_server import (
     IMPATIENT,
     PATIENT,
     TASK,
+    PolicyServer,
     batch,
     counting,
     frames_of,
     free_port,
     make,
     numbered_image,
+    robomme,
 )
 from tests.support.vla_eval_server import DigestServer, ScriptedServer, action, hello
 
 
 def steps_of(questions: list[dict[str, Any]]) -> list[int]:
-    """Return the steps whose images were sent."""
     return [int(question["observation/image"][0, 0, 0]) for question in questions]
 
 
@@ -52,26 +51,22 @@ def steps_of(questions: list[dict[str, Any]]) -> list[int]:
 
 def test_openpi_gets_liberos_images_under_its_names_whatever_the_environment_calls_them() -> None:
     """And parts of ``robot_state`` where ``keys`` asks for them."""
-    keys = ",".join(
-        [*(f"{theirs}={ours}" for theirs, ours in RemoteConfig().sent().items()), "joints=robot_state.joints.pos"]
-    )
+    sent = [f"{theirs}={ours}" for theirs, ours in RemoteConfig().sent().items()]
+    keys = ",".join([*sent, "joints=robot_state.joints.pos"])
     mapping = {"agentview_image": "second", "robot0_eye_in_hand_image": "first"}
-    task = "turn_on_the_stove_and_turn_it_off"
-    for given, asked in ((None, None), (mapping, keys)):
-        config = MemobenchEnvConfig(tasks=task, convention="libero", camera_name_mapping=given, robot_state=True)
-        (env,) = config.create_envs(1)["temporal"].values()
-        observed = preprocess_observation(env.reset(seed=[20_000])[0]) | {"task": ["do it"]}
-        with PolicyServer() as server:
-            policy = make_policy(RemoteConfig(port=server.port, image_size=0, keys=asked, **PATIENT), env_cfg=config)
-            policy.reset()
-            policy.select_action(observed)
-        (question,) = server.questions
-        joints = question.pop("joints", None)
-        assert set(question) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
-        (episode,) = env.get_attr("episode")
-        for name, image in episode.images().items():
-            assert np.array_equal(question[f"observation/{name}"], image[:, ::-1])
-    assert joints is not None
+    config = MemobenchEnvConfig(tasks=TASK, convention="libero", camera_name_mapping=mapping, robot_state=True)
+    (env,) = config.create_envs(1)["temporal"].values()
+    observed = preprocess_observation(env.reset(seed=[20_000])[0]) | {"task": ["do it"]}
+    with PolicyServer() as server:
+        policy = make_policy(RemoteConfig(port=server.port, image_size=0, keys=keys, **PATIENT), env_cfg=config)
+        policy.reset()
+        policy.select_action(observed)
+    (question,) = server.questions
+    joints = question.pop("joints")
+    assert set(question) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
+    (episode,) = env.get_attr("episode")
+    for name, image in episode.images().items():
+        assert np.array_equal(question[f"observation/{name}"], image[:, ::-1])
     assert np.array_equal(joints, np.float32(episode.sim.robot_state()["joints"]["pos"]))
 
 
@@ -224,16 +219,6 @@ def test_wrong_settings_are_named(settings: dict[str, Any], named: str) -> None:
         RemoteConfig(**settings)
 
 
-def test_lerobots_factories_make_it() -> None:
-    assert get_policy_class("memobench_remote") is RemotePolicy
-    policy = RemotePolicy(RemoteConfig())
-    with pytest.raises(MemobenchError, match="cannot be trained"):
-        policy.forward({})
-    before, after = make_pre_post_processors(policy.config)
-    assert torch.equal(before(batch(3))["observation.images.image"], batch(3)["observation.images.image"])
-    assert torch.equal(after(torch.ones(1, 7)), torch.ones(1, 7))
-
-
 # --- answers ---
 
 
@@ -247,20 +232,16 @@ def test_rlds_grippers_are_converted() -> None:
     assert actions[:, 6].tolist() == [1, 1, 1, -1, -1]
 
 
-@pytest.mark.parametrize(("gripper", "value"), [("rlds", np.nan), ("libero", np.inf)])
-def test_infinite_actions_reach_the_environment(gripper: str, value: float) -> None:
+def test_infinite_actions_reach_the_environment() -> None:
     """The environment ends its own episode with them; an error here would end all episodes."""
-    with PolicyServer(lambda question: {"actions": np.full((10, 7), value)}) as server:
-        found = make(server, gripper=gripper).select_action(batch(0))
-    assert found.shape == (1, 7)
-    assert not torch.isfinite(found).any()
+    with PolicyServer(lambda question: {"actions": np.full((10, 7), np.nan)}) as server:
+        assert make(server, gripper="rlds").select_action(batch(0)).isnan().all()
 
 
 ARRAY = {b"__ndarray__": True, b"data": b"11", b"dtype": "|i1", b"shape": [2]}
 WRONG: list[tuple[Any, str]] = [
     ("Traceback (most recent call last):\n  File …\nKeyError: 'observation/joints'\n", "KeyError: 'observation/joi"),
     ({"actions": np.zeros((10, 8))}, r"\(10, 8\).* \(steps, 7\)"),
-    ({"actions": np.zeros((2, 10, 7))}, r"\(2, 10, 7\)"),
     ({"actions": ["a"]}, "no numbers"),
     ({"action": 1}, r"'actions' .*\['action'\]"),
     ({"actions": np.zeros((3, 7))}, "replan=3"),
@@ -326,10 +307,8 @@ HALF = wire.LARGEST_ANSWER // 2
 MALFORMED: dict[str, bytes] = {
     "deep": b"\x81\xa7actions" + b"\x91" * 100_000,
     "huge shape": array([10**9, 7]),
-    "overflowing shape": array([2**64 - 1, 7]),
     "no rows": array([0, 7], b""),
     "objects": actions([[{}] * 7]),
-    "no action": actions([]),
     "too many actions": actions([[0.0] * 7] * (MOST_ACTIONS + 1)),
     "too large": bytes(wire.LARGEST_ANSWER + 1),
     "empty": b"",

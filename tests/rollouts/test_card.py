@@ -12,8 +12,13 @@ from typing import Any
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
-from lerobot_memobench.rollouts.card import policy_facts, run_facts, training_facts, with_checkpoint
+from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
+from lerobot_memobench.rollouts.card import (
+    policy_facts,
+    run_facts,
+    training_facts,
+    with_checkpoint,
+)
 from tests.support import logs
 
 

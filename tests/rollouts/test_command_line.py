@@ -12,8 +12,14 @@ from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.lerobot import main
-from lerobot_memobench.commands.command_line import parse_words, read_words, recipe_file, recipes, value_of
-from lerobot_memobench.commands.lerobot_commands import lerobot_commands
+from lerobot_memobench.commands.command_line import (
+    lerobot_commands,
+    parse_words,
+    read_words,
+    recipe_file,
+    recipes,
+    value_of,
+)
 from lerobot_memobench.errors import MemobenchError
 
 

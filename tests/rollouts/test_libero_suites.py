@@ -13,10 +13,10 @@ from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.rollouts.plan import EvaluationPlan, plan_line
-from lerobot_memobench.tasks.libero_suites import libero_tasks
+from lerobot_memobench.tasks.catalogue import task_names
 from tests.support.fake_loop import FakeLoop, make_checkpoint
 
-SOUP, CHEESE = libero_tasks("libero_object")[:2]
+SOUP, CHEESE = task_names(suite="libero_object")[:2]
 RANDOM = ["env=memobench", "policy=memobench_random"]
 LINE = [*RANDOM, "suite=libero_object", "tasks=0,1", "episodes=4", "batch_size=2"]
 COMMAND = ["eval", *LINE]
@@ -44,10 +44,7 @@ def error(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 )
 def test_task_numbers_are_liberos_ids(fake_loop: FakeLoop, words: list[str]) -> None:
     found = plan(*words)
-    assert [(task.suite, task.number, task.name) for task in found.grid.tasks] == [
-        ("libero_object", 0, SOUP),
-        ("libero_object", 1, CHEESE),
-    ]
+    assert [task.name for task in found.grid.tasks] == [SOUP, CHEESE]
     assert found.settings.env["suite"] == "libero_object"
     assert not {"task", "task_ids"} & {*found.settings.portable["env"]}, "a card holds one name of each setting"
 
@@ -159,7 +156,7 @@ def test_reports_hold_success_alone(fake_loop: FakeLoop, capsys: pytest.CaptureF
 
 
 def test_tables_hold_ids_in_liberos_order(fake_loop: FakeLoop, capsys: pytest.CaptureFixture[str]) -> None:
-    chosen = [libero_tasks("libero_object")[number] for number in (2, 7)]
+    chosen = [task_names(suite="libero_object")[number] for number in (2, 7)]
     assert sorted(chosen) == chosen[::-1], "the order of ids is not that of names"
     line = ["eval", *RANDOM, "task=libero_object", "task_ids=[2,7]", "episodes=2"]
     assert lerobot([*line, "output_dir=a"]) == 0

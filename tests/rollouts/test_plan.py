@@ -18,7 +18,12 @@ from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import shipped_policies
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import EvaluationPlan, Grid, PlannedTask, Shard, plan_line
+from lerobot_memobench.rollouts.plan import (
+    EvaluationPlan,
+    Grid,
+    Shard,
+    plan_line,
+)
 from lerobot_memobench.rollouts.rerun import plan_of_evaluation, read_repeatable
 from lerobot_memobench.sim import files
 from tests.support.fake_loop import DRAWER, STOVE, make_checkpoint
@@ -252,7 +257,7 @@ def test_a_policy_of_another_package_is_known(tmp_path: Path, monkeypatch: pytes
 
 
 def grid(tasks: str = "ab", runs: int = 10, batch: int = 4, first: int = 0) -> Grid:
-    return Grid(tuple(PlannedTask("temporal", k, Path(name)) for k, name in enumerate(tasks)), runs, batch, first)
+    return Grid(tuple(map(Path, tasks)), runs, batch, first)
 
 
 @given(

@@ -19,12 +19,16 @@ from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evalua
 from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
-from lerobot_memobench.perception.weights import SHIPPED
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, tree_hash
+from lerobot_memobench.perception.detector import SHIPPED
+from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
-from lerobot_memobench.rollouts.plan import plan_line
-from lerobot_memobench.rollouts.rerun import allowed_settings, check_policy, differences_here, read_repeatable
-from lerobot_memobench.rollouts.settings import EvaluationSettings, card_settings
+from lerobot_memobench.rollouts.plan import EvaluationSettings, card_settings, plan_line
+from lerobot_memobench.rollouts.rerun import (
+    allowed_settings,
+    check_policy,
+    differences_here,
+    read_repeatable,
+)
 from tests.support import logs
 from tests.support.fake_loop import DRAWER, STOVE, FakeLoop, make_checkpoint
 
@@ -116,11 +120,11 @@ def test_a_card_names_only_a_server_of_this_machine() -> None:
 def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rerun, "local_folder", lambda path: Path("checkpoint") if path == "user/name" else None)
     asked = allowed(policy={"path": "user/name"})
-    assert asked.policy_path == str(Path("checkpoint").absolute())
+    assert asked.policy["path"] == str(Path("checkpoint").absolute())
     facts = {"sha256": tree_hash(checkpoint_files(Path("checkpoint")))}
     seeing = {"settings": {"perception": "objects", "detector": "package"}, "detector_sha256": file_hash(SHIPPED)}
     for known in (facts, facts | seeing):
-        check_policy({"policy": known}, asked.policy_path)
+        check_policy({"policy": known}, asked.policy["path"])
     for other, named in (
         ({}, "checkpoint"),
         (facts | {"sha256": "0" * 64}, "checkpoint"),
@@ -128,7 +132,7 @@ def test_checkpoint_and_detector_are_those_on_the_card(monkeypatch: pytest.Monke
         (facts | {"settings": seeing["settings"]}, "detector package"),
     ):
         with pytest.raises(MemobenchError, match=named):
-            check_policy({"policy": other}, asked.policy_path)
+            check_policy({"policy": other}, asked.policy["path"])
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,10 @@ from lerobot_memobench.constants import SPLITS
 from lerobot_memobench.datasets.generate import generate
 from lerobot_memobench.envs.episode import Episode, generator, referent_of
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import headline, read_runs
 from lerobot_memobench.rollouts.card import card_of
-from lerobot_memobench.rollouts.plan import plan_line
+from lerobot_memobench.rollouts.plan import card_settings, plan_line
 from lerobot_memobench.rollouts.rerun import plan_of_evaluation
-from lerobot_memobench.rollouts.settings import card_settings
 from lerobot_memobench.rollouts.shards import plan_shards
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support.fake_loop import STOVE, FakeLoop

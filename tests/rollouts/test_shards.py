@@ -16,7 +16,7 @@ from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation, write_facts
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import headline
+from lerobot_memobench.evaluation.records import headline
 from lerobot_memobench.rollouts.card import policy_facts, run_facts
 from lerobot_memobench.rollouts.plan import plan_line
 from lerobot_memobench.rollouts.shards import merge, merge_and_report, part_folders, plan_shards

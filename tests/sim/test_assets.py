@@ -189,7 +189,7 @@ def test_damaged_download_is_fetched_again(hub: Hub, home: Path) -> None:
     folder = files.obtain().folder
     (folder / PLATE).resolve().write_bytes(b"black")
     files._verified.cache_clear()
-    assert files.obtain() == files.AssetsFolder(files.HUB_CACHE, folder, "")
+    assert files.obtain() == files.AssetsFolder(files.HUB_CACHE, folder)
     assert files.asset(PLATE).read_bytes() == CONTENT[PLATE]
 
 

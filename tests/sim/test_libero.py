@@ -20,9 +20,8 @@ from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.robot import SUBSTEPS
 from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import LIBERO_SUITES, get_task, initial_states, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.libero_suites import LIBERO_SUITES, get_libero_task, initial_states, libero_tasks
 from lerobot_memobench.tasks.task import Task
 from tests.support.libero import (
     fields,
@@ -61,7 +60,7 @@ ONE_OF_EACH_ARENA = {
     "kitchen_table": "KITCHEN_SCENE4_put_the_black_bowl_in_the_bottom_drawer_of_the_cabinet_and_close_it",
 }
 FLOOR, KITCHEN = ONE_OF_EACH_ARENA["floor"], ONE_OF_EACH_ARENA["kitchen_table"]
-SUITE_TASKS = [name for suite in LIBERO_SUITES for name in libero_tasks(suite)]
+SUITE_TASKS = [name for suite in LIBERO_SUITES for name in task_names(suite=suite)]
 
 
 def slow_but(names: list[str], quick: Any) -> list[Any]:
@@ -79,7 +78,7 @@ SUITES = slow_but(tasks_of("suites"), ONE_OF_EACH_ARENA.values())
 
 
 def start(name: str, seed: int = 7, state: int = 0) -> Simulation:
-    sim = Simulation(get_libero_task(name))
+    sim = Simulation(get_task(name))
     sim.reset(seed, state=initial_states(name)[state])
     return sim
 
@@ -103,19 +102,19 @@ def test_the_model_is_stock_liberos(name: str) -> None:
 
 @pytest.mark.parametrize("name", slow_but(SUITE_TASKS, ONE_OF_EACH_ARENA.values()))
 def test_the_model_of_a_suite_is_stock_liberos(name: str) -> None:
-    check_model(get_libero_task(name), record("executions"))
-    assert Simulation(get_libero_task(name)).state_dim == initial_states(name).shape[1]
+    check_model(get_task(name), record("executions"))
+    assert Simulation(get_task(name)).state_dim == initial_states(name).shape[1]
 
 
 def test_records_cover_all_tasks_predicates_and_arenas() -> None:
     assert sorted(record("models")["tasks"]) == sorted(task_names())
     order = record("executions")["tasks"]
-    assert {suite: tuple(name for name in order if name in libero_tasks(suite)) for suite in LIBERO_SUITES} == {
-        suite: libero_tasks(suite) for suite in LIBERO_SUITES
+    assert {suite: [name for name in order if name in task_names(suite=suite)] for suite in LIBERO_SUITES} == {
+        suite: task_names(suite=suite) for suite in LIBERO_SUITES
     }
     words = {str(atom).split()[0] for key, kept in record("suites").items() if key.endswith(":atoms") for atom in kept}
     assert words == {"in", "on", "open", "close", "turnon", "turnoff"}
-    assert {table: arena_of(get_libero_task(name)) for table, name in ONE_OF_EACH_ARENA.items()} == ARENAS
+    assert {table: arena_of(get_task(name)) for table, name in ONE_OF_EACH_ARENA.items()} == ARENAS
 
 
 # --- scenes ---
@@ -169,7 +168,7 @@ def test_groceries_inside_the_table_are_not_thrown() -> None:
 
 
 def test_states_and_classes_of_other_tasks_are_refused() -> None:
-    sim = Simulation(get_libero_task(FLOOR))
+    sim = Simulation(get_task(FLOOR))
     with pytest.raises(MemobenchError, match=r"has shape \(79,\); expected \(110,\)"):
         sim.reset(7, state=initial_states(ONE_OF_EACH_ARENA["table"])[0])
     with pytest.raises(MemobenchError, match=r"use env\.obs_type=pixels_agent_pos$"):
@@ -190,7 +189,7 @@ def test_predicates_are_stock_liberos(name: str) -> None:
 @pytest.mark.parametrize("name", SUITES)
 def test_atoms_of_goals_equal_stock_libero(name: str) -> None:
     kept = record("suites")
-    _, found = recorded_answers(Simulation(get_libero_task(name)), kept, name)
+    _, found = recorded_answers(Simulation(get_task(name)), kept, name)
     assert np.array_equal([[*held, all(held)] for held in found], kept[f"{name}:answers"])
     assert kept[f"{name}:answers"].any()
 
@@ -228,7 +227,7 @@ def test_rollout_outcomes_equal_stock_libero(name: str) -> None:
 @pytest.mark.parametrize("suite", slow_but(list(LIBERO_SUITES), {*LIBERO_SUITES} - {"libero_10"}))
 def test_a_scripted_execution_succeeds_at_the_same_step(suite: str) -> None:
     kept = part_of("executions", f"{suite}:")
-    sim, actions = start(libero_tasks(suite)[kept["task_id"]]), kept["actions"]
+    sim, actions = start(task_names(suite=suite)[kept["task_id"]]), kept["actions"]
     succeeded = []
     for action in [*actions, *[actions[-1]] * STEPS]:
         sim.step(action)
@@ -243,7 +242,7 @@ def test_a_scripted_execution_succeeds_at_the_same_step(suite: str) -> None:
 def test_observations_are_those_of_lerobots_libero(suite: str) -> None:
     """robosuite observes fingers 2 ms and the hand 4 ms before the end of a control step; images bottom up."""
     seen = part_of("observations", f"{suite}:")
-    sim = start(libero_tasks(suite)[{"libero_spatial": 0, "libero_object": 3}[suite]])
+    sim = start(task_names(suite=suite)[{"libero_spatial": 0, "libero_object": 3}[suite]])
     assert np.abs(sim.proprio() - seen["0.processed.observation.state"][0]).max() <= AT_REST
     for camera, image in (("agentview", "image"), ("wrist", "image2")):
         ours, theirs = sim.render(camera)[::-1].astype(int), seen[f"0.raw.pixels.{image}"]

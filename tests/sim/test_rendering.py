@@ -79,6 +79,11 @@ def test_highlights_are_drawn_and_go_away(simulate: Simulate) -> None:
         sim.render()
 
 
+def test_an_unknown_camera_is_an_error(simulate: Simulate) -> None:
+    with pytest.raises(MemobenchError, match=r"'agentwiev'.*'agentview'"):
+        simulate().render("agentwiev")
+
+
 # --- caches ---
 
 SCENES = {

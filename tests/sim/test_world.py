@@ -130,7 +130,6 @@ def test_on_a_region_of_the_table_needs_no_contact(simulate: Simulate) -> None:
 @pytest.mark.parametrize(
     ("atom", "fragment"),
     [
-        (Atom("in", ("no_such_thing", "wooden_cabinet_1_top_region")), "'no_such_thing'"),
         (Atom("in", (TOMATO, "wooden_cabinet_1_attic_region")), "'wooden_cabinet_1_attic_region'"),
         (Atom("open", (TOMATO,)), "cannot be opened"),
         (Atom("wasopen", ("wooden_cabinet_1_top_region",)), "'wasopen'"),

@@ -16,9 +16,9 @@ from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import write_episodes
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.policies.checkpoint import tree_hash
+from lerobot_memobench.tasks.assessment import chance, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.evidence import chance, scene_and_variant
 from lerobot_memobench.tasks.task import STRICT
 from tests.support.logs import card
 
@@ -97,8 +97,6 @@ def first_failure(records: list[Json]) -> Json:
 
 
 def in_log(change: Callable[[list[Json]], object]) -> Callable[[Path], None]:
-    """A change of the log."""
-
     def apply(folder: Path) -> None:
         lines = [json.loads(each) for each in gzip.decompress((folder / LOG).read_bytes()).splitlines()]
         change(lines)
@@ -117,7 +115,6 @@ def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
 
 
 def stating(key: str, value: Any) -> Callable[[Path], None]:
-    """A statement of the submitter."""
     return in_card(lambda content: content["submission"].__setitem__(key, value))
 
 

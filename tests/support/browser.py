@@ -130,7 +130,6 @@ class Browser:
             self.requests.append(found["request"]["url"])
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Send a command to the page and return its result."""
         return self._call(method, self._session, **parameters)
 
     # --- what tests do ---
@@ -145,7 +144,6 @@ class Browser:
         self.wait("document.readyState === 'complete' && location.href !== 'about:blank'")
 
     def js(self, expression: str) -> Any:
-        """Return the value of a JavaScript expression; a promise is waited for."""
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
             details = answer["exceptionDetails"]
@@ -192,7 +190,6 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyUp", **event)
 
     def write(self, selector: str, text: str) -> None:
-        """Put the cursor into a field and write."""
         self.js(f"document.querySelector({json.dumps(selector)}).focus()")
         self.call("Input.insertText", text=text)
 
@@ -205,7 +202,6 @@ class Browser:
         )
 
     def resize(self, width: int, height: int) -> None:
-        """Give the page another size, CSS pixels."""
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def colours(self, scheme: str) -> None:
@@ -213,16 +209,13 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
 
     def screenshot(self, path: Path) -> Path:
-        """Save what is seen as PNG."""
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
         return path
 
     def texts(self, selector: str) -> list[str]:
-        """Return the visible text of every element that is found."""
         return self.js(f"[...document.querySelectorAll({json.dumps(selector)})].map((e) => e.innerText)")
 
     def close(self) -> None:
-        """End the browser and all its processes."""
         try:
             self._call("Browser.close")
         except (RuntimeError, OSError):

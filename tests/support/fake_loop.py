@@ -13,6 +13,8 @@ from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, read_episodes
+from lerobot_memobench.envs.evaluation_file import write_evaluation
+from lerobot_memobench.rollouts.card import with_checkpoint
 from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan
 from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.tasks.task import Task
@@ -44,10 +46,10 @@ class FakeLoop:
         self.changed: dict[str, Any] = {}
         self.before: Callable[[EvaluationPlan], object] = lambda plan: None
 
-    def __call__(self, plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Any) -> None:
+    def __call__(self, plan: EvaluationPlan, cells: Sequence[Cell], card: dict[str, Any], advance: Any) -> None:
         self.plans.append(plan)
         self.cells.append(cells)
-        begin()
+        write_evaluation(plan.log, with_checkpoint(card, plan))
         self.before(plan)
         log = EpisodeLog(plan.log)
         logged = read_episodes(plan.log) if has_log(plan.log) else []
@@ -61,7 +63,7 @@ class FakeLoop:
                         raise Killed
                     self.kill_after -= 1
                 self.ran.append((name, episode))
-                log.append(self.record(load_task(cell[0].folder), episode, plan.environment.seed_base + episode))
+                log.append(self.record(load_task(cell[0]), episode, plan.environment.seed_base + episode))
             advance(len(self.ran), len(self.ran), cell[0].name)
 
     def record(self, task: Task, episode: int, seed: int) -> dict[str, Any]:
@@ -113,7 +115,6 @@ def make_checkpoint(folder: Path, kind: str = "memobench_random", **config: Any)
 
 
 def content(folder: Path) -> dict[Path, bytes]:
-    """Return the bytes of every file below a folder."""
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

@@ -35,7 +35,6 @@ class ForkServer:
         )
 
     def close(self) -> None:
-        """End the process; its forks go on."""
         self._process.communicate()
 
     def start(self, code: str, output: Path, errors: Path | None = None, **environment: str) -> Fork:
@@ -65,8 +64,6 @@ class ForkServer:
 
 
 class Fork:
-    """A piece of code that runs."""
-
     def __init__(self, server: ForkServer, pid: int) -> None:
         self.server, self.pid, self.status = server, pid, None
 
@@ -77,7 +74,6 @@ class Fork:
         return self.status
 
     def wait(self) -> int:
-        """Return the exit status once there is one."""
         if self.status is None:
             self.status = self.server._ask({"wait": self.pid, "options": 0})
         return self.status

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 
-def killed_at(holder: Any, name: str, call: int | str, work: Callable[[], object], *, after: bool = False) -> None:
-    """Do ``work`` in a child that gets SIGKILL before, or ``after``, the ``call``-th call of ``holder.name``.
+def killed_at(holder: Any, name: str, call: int | str, work: Callable[[], object]) -> None:
+    """Do ``work`` in a child that gets SIGKILL before the ``call``-th call of ``holder.name``.
 
     A ``call`` that is a text is the first one whose last argument is a path that ends so.
     A child that hangs, which a fork of a process with threads may, gets SIGALRM instead.
@@ -31,13 +31,9 @@ def killed_at(holder: Any, name: str, call: int | str, work: Callable[[], object
         def fatal(*args: Any, **settings: Any) -> Any:
             nonlocal count
             count += 1
-            chosen = count == call if isinstance(call, int) else str(args[-1]).endswith(call)
-            if chosen and not after:
+            if count == call if isinstance(call, int) else str(args[-1]).endswith(call):
                 os.kill(os.getpid(), signal.SIGKILL)
-            result = inner(*args, **settings)
-            if chosen:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return result
+            return inner(*args, **settings)
 
         setattr(holder, name, fatal)
         work()

@@ -25,12 +25,10 @@ HEIGHT, SLOPE, HALF = 0.8, 0.4, 12
 
 
 def small_encoder() -> VisualEncoder:
-    """Return an encoder of a few thousand weights."""
     return VisualEncoder((4, 4, 8, 8, 16), (0, 0, 0, 1, 0))
 
 
 def simulation(name: str) -> Simulation:
-    """Return the simulation of a task, reset."""
     sim = Simulation(get_task(name))
     sim.reset(20_000)
     return sim

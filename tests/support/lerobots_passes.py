@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from lerobot_memobench.policies.memobench_mem.fusion import (
     MemoryModulator,
     MemoryPass,
-    Modulation,
     ModulationPass,
     Prefix,
     rms_norm,
@@ -73,7 +72,7 @@ def lerobots_passes(ours: MemoryPI05, memory: MemoryTokens | None) -> Iterator[P
     """Yield a model that computes with the very parameters of ours, by LeRobot's passes, while this lasts."""
     layers: Any = ours.paligemma_with_expert.gemma_expert.model.layers
     norms, passes = [layer.post_attention_layernorm for layer in layers], Passes(ours, memory)
-    if isinstance(ours.fusion, Modulation):
+    if ours.fusion is ModulationPass:
         for layer, norm, modulator in zip(layers, norms, ours.modulators, strict=True):  # type: ignore[arg-type]
             layer.post_attention_layernorm = Norm(norm, modulator, passes)
     try:

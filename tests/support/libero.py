@@ -27,7 +27,6 @@ VISIBLE_GROUP, HIDDEN_GROUP = 5, 4
 
 @cache
 def record(kind: str) -> dict[str, NDArray[Any]]:
-    """Return the records of a kind."""
     with np.load(RECORDS / f"{kind}.npz", allow_pickle=False) as stored:
         return dict(stored)
 
@@ -61,7 +60,6 @@ def some_of_all(names: list[str]) -> list[Any]:
 
 
 def simulate(name: str) -> Simulation:
-    """Return a simulation of a task."""
     return Simulation(get_task(name))
 
 

@@ -1,20 +1,23 @@
-"""A demonstration of LIBERO's world as the authors' collecting script would have written it: scene, states, attributes.
+"""Demonstrations of LIBERO's world as HDF5: as the authors' collecting script writes them, and as published.
 
-Bodies have robosuite's names. Written from the layout's description, independent of the reader.
+Bodies have robosuite's names. Written from the layouts' descriptions, independent of the reader.
 """
 
 from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from lerobot_memobench.datasets.demonstration import Demonstration
+from lerobot_memobench.datasets.demonstration import Demonstration, key_frames
+from lerobot_memobench.datasets.hdf5 import IMAGE_NAMES
 from lerobot_memobench.sim.scene import get_scene
+from lerobot_memobench.tasks.task import BDDL_FILE
 
 CAMERAS = {"agentview_image": "image", "robot0_eye_in_hand_image": "wrist_image"}
 LIBERO_CAMERAS = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
@@ -94,3 +97,36 @@ def write(
             meta_data = given | {"key_frame": [-1] * len(given["subtask_goals"])} | metadata
             group.attrs.update(num_samples=len(states), model_file=scene, meta_data=json.dumps(meta_data))
     return path
+
+
+def write_published(path: Path, demos: Sequence[Demonstration], scene: str | None = None) -> Path:
+    """Write demonstrations of one task with key frames and images; ``scene``: their MJCF in place of the real one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        task = demos[0].task.variant(0)
+        data.attrs.update(bddl_file_name=f"{task.memory_type}/{task.name}/{BDDL_FILE}", memory_type=task.memory_type)
+        data.attrs.update(bddl_file_content=task.bddl_text, num_demos=len(demos), total=sum(map(len, demos)))
+        for number, demo in enumerate(demos):
+            assert demo.images is not None
+            group = data.create_group(f"demo_{number}")
+            group["states"], group["actions"] = demo.states, demo.actions
+            for camera, name in IMAGE_NAMES.items():
+                group.create_dataset(
+                    f"obs/{name}",
+                    data=demo.images[camera],
+                    chunks=(1, *demo.images[camera].shape[1:]),
+                    compression="gzip",
+                    compression_opts=1,
+                )
+            model_file = libero_scene(demo) if scene is None else scene
+            group.attrs.update(num_samples=len(demo), model_file=model_file, meta_data=json.dumps(demo_metadata(demo)))
+    return path
+
+
+def demo_metadata(demo: Demonstration) -> dict[str, Any]:
+    metadata = dict(demo.task.metadata)
+    metadata["key_frame"] = key_frames(demo).tolist()
+    as_list = isinstance(metadata.get("timestep_exec_start_idx"), list)
+    metadata["timestep_exec_start_idx"] = [demo.exec_start] if as_list else demo.exec_start
+    return metadata

@@ -46,7 +46,6 @@ LONGEST_SENTENCE = 4_000
 
 
 def nested(depth: int) -> list[Any]:
-    """Return lists within lists."""
     value: list[Any] = []
     for _ in range(depth):
         value = [value]

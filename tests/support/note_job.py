@@ -17,21 +17,17 @@ class Note:
     task_name: str = "note"
 
     def run(self) -> None:
-        """Write."""
         with (self.folder / "runs").open("a") as file:
             file.write("x")
 
     def finished(self) -> bool:
-        """Whether it has been run."""
         return (self.folder / "runs").is_file()
 
     def failure(self) -> str | None:
-        """Return a reason where the number is odd."""
         return "odd" if self.seed % 2 else None
 
     @property
     def runs(self) -> int:
-        """How often it has been run."""
         return len((self.folder / "runs").read_text())
 
 
@@ -39,5 +35,4 @@ class Killed(Note):
     """Ends its process as the kernel does when memory runs out."""
 
     def run(self) -> None:
-        """Kill this process."""
         os.kill(os.getpid(), signal.SIGKILL)

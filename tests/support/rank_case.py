@@ -64,7 +64,6 @@ def run_rank(rank: int, folder: Path) -> None:
     dist.init_process_group("gloo", init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=len(RANKS))
 
     def parallel(module: nn.Module) -> nn.Module:
-        """As LeRobot wraps it."""
         return DistributedDataParallel(module, find_unused_parameters=True)
 
     found = [step(*case, RANKS[rank], parallel) for case in CASES]  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.record import RecordingSettings, compiled_episode, record
+from lerobot_memobench.datasets.generate import RecordingSettings, compiled_episode, record
 from lerobot_memobench.datasets.validate import resimulate
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -28,11 +28,7 @@ def record_demonstration(task: Task, seed: int, *, variant: int = 0, **settings:
 
 
 def drawn_steps(
-    task_name: str,
-    seed: int,
-    frames: int,
-    exec_start: int = 0,
-    holds: Sequence[tuple[int, int]] = (),
+    task_name: str, seed: int, frames: int, exec_start: int = 0, holds: Sequence[tuple[int, int]] = ()
 ) -> Demonstration:
     """Return as many steps of drawn actions; ``exec_start`` of them are of the prompt.
 
@@ -58,7 +54,6 @@ def beginning(demo: Demonstration, frames: int) -> Demonstration:
 
 
 def with_images(demo: Demonstration, size: int) -> Demonstration:
-    """Return it with the cameras' images."""
     sim = Simulation(demo.task, RenderSettings(size, size))
     sim.reset(demo.seed)
     images: dict[str, list[np.ndarray]] = {name: [] for name in CAMERAS}

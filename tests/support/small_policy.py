@@ -1,18 +1,21 @@
-"""A small memory policy with its processors and samples, as `lerobot train` makes them; shared by tests."""
+"""A small memory policy with its processors and samples, as `lerobot train` makes them, and the frames it remembers."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from torch import Tensor
 
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory.frames import sample_frames
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import FRAMES, PLACES, STEPS, Histories
 from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING
 from lerobot_memobench.training.data import Training, open_datasets, open_training
-from lerobot_memobench.training.loop import train
 
 CHUNK = 6
 
@@ -42,21 +45,9 @@ def draw_modulation(module: torch.nn.Module, std: float = 0.2) -> None:
                 parameter.normal_(std=std)
 
 
-def train_config(root: Path, config: MemobenchMemConfig, **settings: Any) -> TrainPipelineConfig:
-    """Return LeRobot's configuration of a training on a dataset."""
-    return TrainPipelineConfig(DatasetConfig("memobench/synthetic", root=str(root)), policy=config, **settings)
-
-
-def train_with(config: TrainPipelineConfig) -> None:
-    """Train as `lerobot train` does, by a configuration of LeRobot's."""
-    policy: Any = config.policy
-    config.optimizer, config.scheduler = policy.get_optimizer_preset(), policy.get_scheduler_preset()
-    train(config)
-
-
 def open_small_training(root: Path, config: MemobenchMemConfig) -> Training:
     """Return the training of a policy on a dataset; weights are drawn from seed 0."""
-    whole = train_config(root, config)
+    whole = TrainPipelineConfig(DatasetConfig("memobench/synthetic", root=str(root)), policy=config)
     datasets = open_datasets(whole)
     torch.manual_seed(0)
     return open_training(whole, datasets)
@@ -90,3 +81,25 @@ class Samples:
 
 def batch_of(samples: Any, indices: list[int]) -> dict[str, Any]:
     return torch.utils.data.default_collate([samples[index] for index in indices])
+
+
+def histories(frames: Tensor, steps: Tensor, mask: Tensor) -> Histories:
+    """Return histories of frames (B, F, P, D) at steps (B, F) with a mask (B, F), without shared frames."""
+    places = torch.arange(mask.numel(), device=mask.device).reshape(mask.shape)
+    return Histories(frames.flatten(0, 1), steps.flatten(), places.masked_fill(~mask, -1))
+
+
+def trained_on(batch: Mapping[str, Tensor]) -> list[tuple[Tensor, list[int]]]:
+    """Return the remembered frames (n, P, D) of each training sample, and their control steps."""
+    places = [row[row >= 0] for row in batch[PLACES]]
+    return [(batch[FRAMES][row], batch[STEPS][row].tolist()) for row in places]
+
+
+def remembered(policy: Any, rows: Sequence[int]) -> list[tuple[Tensor, list[int]]]:
+    """Return the remembered frames of rows of a policy's rollout, and their control steps."""
+    found = []
+    for row in rows:
+        (kept,) = policy.rollout.envs[row].memory
+        read = [kept[slot] for slot in sample_frames(len(kept) - 1, policy.model.memory.settings.frames)]
+        found.append((torch.stack([frame.stored for frame in read]), [frame.step for frame in read]))
+    return found

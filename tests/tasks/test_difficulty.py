@@ -15,8 +15,7 @@ from lerobot_memobench.envs.episode_log import episode_record, read_log, write_e
 from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.headline import protocol_phrases
-from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.records import protocol_phrases, read_runs
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DIFFICULTIES, STANDARD, STRICT, Difficulty
 from tests.support.logs import facts

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import pytest
 
+from lerobot_memobench.tasks.assessment import classify_failure
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.progress import Progress
 

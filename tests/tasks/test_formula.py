@@ -191,13 +191,3 @@ def test_operators_equal_their_definitions(
     assert follow(When((condition, formula)), states)[0] == [k >= first and found[first] for k in steps]
     latched = list(itertools.accumulate((B in state for state in states), max))
     assert follow(LATCH, states)[0] == latched
-
-
-@given(FORMULAS, STATES)
-def test_reset_clears_all_state(formula: Formula, states: list[set[Atom]]) -> None:
-    evaluator = Evaluator([formula])
-    fresh = evaluator.memory
-    first = [evaluator.step(state.__contains__) for state in states]
-    evaluator.reset()
-    assert (evaluator.memory, evaluator.settled) == (fresh, (None,))
-    assert [evaluator.step(state.__contains__) for state in states] == first

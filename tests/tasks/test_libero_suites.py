@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.tasks import libero_suites
-from lerobot_memobench.tasks.catalogue import suite_of, task_names
+from lerobot_memobench.tasks.catalogue import get_task, initial_states, suite_of, task_names
 from lerobot_memobench.tasks.formula import atoms
-from lerobot_memobench.tasks.libero_suites import get_libero_task, initial_states, libero_tasks
 from lerobot_memobench.tasks.task import LIBERO_SUITES
 
 
 def test_suites_hold_130_tasks_of_other_names_than_the_catalogue() -> None:
-    names = [name for suite in LIBERO_SUITES for name in libero_tasks(suite)]
-    assert [len(libero_tasks(suite)) for suite in LIBERO_SUITES] == [10, 10, 10, 10, 90]
+    names = [name for suite in LIBERO_SUITES for name in task_names(suite=suite)]
+    assert [len(task_names(suite=suite)) for suite in LIBERO_SUITES] == [10, 10, 10, 10, 90]
     assert len({*names, *task_names(suite=None)}) == 130 + 60
 
 
 def test_goals_are_conjunctions_of_libero_s_predicates() -> None:
     """Counts of LIBERO's files."""
-    tasks = [get_libero_task(name) for suite in LIBERO_SUITES for name in libero_tasks(suite)]
+    tasks = [get_task(name) for suite in LIBERO_SUITES for name in task_names(suite=suite)]
     counts = Counter(atom.predicate for task in tasks for atom in atoms(task.goal))
     assert counts == {"in": 63, "on": 61, "close": 11, "turnon": 8, "open": 7, "turnoff": 1}
     assert not any(task.checkpoints or task.prompt or task.variants for task in tasks)
@@ -44,22 +40,8 @@ def test_initial_states_are_those_of_libero() -> None:
 
 def test_unknown_names_are_refused_with_the_nearest_one() -> None:
     with pytest.raises(MemobenchError, match="did you mean 'put_the_bowl_on_the_plate'"):
-        get_libero_task("put_the_bowl_on_a_plate")
+        get_task("put_the_bowl_on_a_plate")
     with pytest.raises(MemobenchError, match="did you mean 'put_the_bowl_on_the_plate'"):
         initial_states("put_the_bowl_on_a_plate")
     with pytest.raises(MemobenchError, match="did you mean 'libero_goal'"):
-        libero_tasks("libero_goals")
-
-
-def test_a_damaged_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = Path(shutil.copy(libero_suites.FOLDER / "libero_goal.zip", tmp_path))
-    content = bytearray(path.read_bytes())
-    content[1000:30000] = bytes(29000)
-    path.write_bytes(content)
-    monkeypatch.setattr(libero_suites, "FOLDER", tmp_path)
-    name = "open_the_middle_drawer_of_the_cabinet"
-    with pytest.raises(MemobenchError, match=r"libero_goal\.zip is not the file of this package"):
-        initial_states.__wrapped__(name)
-    path.write_bytes(b"")
-    with pytest.raises(MemobenchError, match="install the package again"):
-        libero_suites._names.__wrapped__("libero_goal")
+        task_names(suite="libero_goals")

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_memobench.tasks.assessment import classify_failure
 from lerobot_memobench.tasks.bddl import parse_bddl
 from lerobot_memobench.tasks.catalogue import get_task, task_index, task_names
-from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.formula import Atom, atoms
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import MEMORY_TYPES, STRICT, Task

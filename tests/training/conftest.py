@@ -16,33 +16,14 @@ torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
-def synthetic(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Images of squares, with one prompt; tests that change it copy it."""
-    from tests.support.synthetic_dataset import make_dataset
-
-    return make_dataset(tmp_path_factory.mktemp("data") / "synthetic")
-
-
-@pytest.fixture(scope="session")
-def objects(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Object slots without images, with two prompts and records."""
-    from tests.support.object_dataset import make_object_dataset
-
-    return make_object_dataset(tmp_path_factory.mktemp("data") / "objects", records=True)
-
-
-@pytest.fixture(scope="session")
 def imaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Object slots and images, with two prompts."""
-    from tests.support.object_dataset import make_object_dataset
+    from tests.support.synthetic_dataset import make_object_dataset
 
     return make_object_dataset(tmp_path_factory.mktemp("data") / "imaged", images=True)
 
 
 @pytest.fixture(scope="session")
 def train() -> Callable[..., None]:
-    """Train a memory policy by the words of ``lerobot train``."""
-
     def run(*words: str) -> None:
         from lerobot_memobench.commands.command_line import parse_words, read_words
         from lerobot_memobench.training.command import complete_training, with_last_checkpoint

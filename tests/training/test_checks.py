@@ -22,7 +22,7 @@ from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 from lerobot_memobench.training.command import READ, check_settings, complete_training
 from lerobot_memobench.training.data import open_metadata
 from lerobot_memobench.training.loop import begin
-from tests.support.object_dataset import make_object_dataset
+from tests.support.synthetic_dataset import make_object_dataset
 
 LEROBOTS = [  # checks of LeRobot's configuration
     ("eval_steps=2", "dataset.eval_split"),

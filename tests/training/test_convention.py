@@ -28,9 +28,9 @@ from lerobot_memobench.policies.memobench_mem.objects import VIEWS
 from lerobot_memobench.sim.convention import convention_of
 from lerobot_memobench.training.data import check_environment
 from lerobot_memobench.training.features import detected_slots
-from lerobot_memobench.training.trainer import prepare
-from lerobot_memobench.training.view import ViewOptions, write_view
+from lerobot_memobench.training.trainer import ViewOptions, prepare, write_view
 from tests.support.fake_loop import make_checkpoint
+from tests.support.synthetic_dataset import write_robot
 
 NAMES = ("observation.images.image", "observation.images.image2")
 CAMERAS_OF = {"upright": VIEWS, "libero": NAMES}
@@ -83,19 +83,7 @@ def test_a_view_turns_videos_into_the_other_convention(
 @pytest.fixture
 def liberos(tmp_path: Path) -> Path:
     """A dataset of another package with LIBERO's names, whose images are PNG in the tables."""
-    image = {"dtype": "image", "shape": (16, 24, 3), "names": ["height", "width", "channels"]}
-    numbers = {"dtype": "float32", "shape": (3,), "names": None}
-    features = {**dict.fromkeys(NAMES, image), "observation.state": numbers, "action": numbers}
-    made = LeRobotDataset.create("local/made", 10, features, root=tmp_path / "made", use_videos=False)
-    rng = np.random.default_rng(0)
-    for _ in range(2):
-        for _ in range(4):
-            images = {name: rng.integers(0, 255, image["shape"], np.uint8) for name in NAMES}
-            vectors = {name: rng.random(3, np.float32) for name in ("observation.state", "action")}
-            made.add_frame(images | vectors | {"task": "open the drawer"})
-        made.save_episode()
-    made.finalize()
-    return tmp_path / "made"
+    return write_robot(tmp_path / "made", dict.fromkeys(NAMES, (16, 24)), 3, 3, episodes=2)
 
 
 def test_a_view_turns_images_to_the_bit(liberos: Path, tmp_path: Path) -> None:

@@ -14,14 +14,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, SUBGOALS
 from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from tests.support import rank_case
-from tests.support.fork_server import ForkServer
-from tests.support.small_policy import (
-    CHUNK,
-    batch_of,
-    draw_modulation,
-    made_for_training,
-    small_config,
-)
+from tests.support.small_policy import CHUNK, batch_of, draw_modulation, made_for_training, small_config
 
 
 @pytest.mark.parametrize("memory", ["none", "frames"])
@@ -75,11 +68,7 @@ def test_evaluation_loss_uses_the_memorys_own_choice(objects: Path, memory: str)
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("ranks")
-    forks = ForkServer([rank_case.__name__])
-    code = "from pathlib import Path; from tests.support.rank_case import run_rank; run_rank({}, Path({!r}))"
-    running = [forks.start(code.format(rank, str(folder)), folder / f"{rank}.txt") for rank in range(2)]
-    assert [fork.wait() for fork in running] == [0, 0], [file.read_text() for file in folder.glob("*.txt")]
-    forks.close()
+    torch.multiprocessing.spawn(rank_case.run_rank, (folder,), nprocs=2)
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from lerobot_memobench.constants import OBS_PHASE, OBS_STEP
 from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.average import TRAINING_FILE
+from lerobot_memobench.training.loop import TRAINING_FILE
 from tests.training.conftest import hashes, read_losses
 
 SEEN = {
@@ -82,7 +82,6 @@ def test_held_out_loss_is_logged(objects: Path, tmp_path: Path, train: Callable[
 
 @pytest.fixture(scope="module")
 def begun(objects: Path, tmp_path_factory: pytest.TempPathFactory, train: Callable[..., None]) -> Path:
-    """A checkpoint of two updates."""
     out = tmp_path_factory.mktemp("begun") / "run"
     train("policy=memobench_mem", *SEEN["objects"], f"dataset={objects}", f"output_dir={out}", "steps=2")
     return out / "checkpoints/last/pretrained_model"

@@ -19,13 +19,7 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem as modeling
-from lerobot_memobench.training.data import (
-    DecodedSamples,
-    Training,
-    execution_statistics,
-    open_datasets,
-    open_training,
-)
+from lerobot_memobench.training.data import DecodedSamples, Training, execution_statistics, open_datasets, open_training
 from lerobot_memobench.training.loop import make_held_out_loader, make_sampler
 from lerobot_memobench.training.sampler import FrameSampler, grouped_order, weighted_order
 from tests.support.held_dataset import HELD, LENGTHS, PROMPTS, STRETCHES, make_held_dataset
@@ -131,7 +125,6 @@ def test_held_out_samples_are_spread_over_the_episodes(objects: Path) -> None:
     frames = loader.dataset.indices
     episodes = [training.lookup.locate(frame)[0] for frame in frames]
     held_out = training.held_out
-    assert held_out is not None
     assert len(frames) <= 5
     assert set(episodes) == set(held_out.episodes or [])
     first, last = training.lookup.episodes[episodes[-1]], training.lookup.episodes[episodes[-1] + 1]

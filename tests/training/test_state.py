@@ -16,8 +16,7 @@ from lerobot.utils.random_utils import load_rng_state
 from safetensors import safe_open
 from torch import nn, optim
 
-from lerobot_memobench.training.average import TRAINING_FILE, WeightAverage
-from lerobot_memobench.training.loop import TrainingLog, load_state, save_state
+from lerobot_memobench.training.loop import TRAINING_FILE, TrainingLog, WeightAverage, load_state, save_state
 from tests.training.conftest import read_losses
 
 
@@ -94,16 +93,3 @@ def test_bfloat16_weights_have_a_saved_float32_average(tmp_path: Path) -> None:
     assert again.restore(tmp_path / TRAINING_FILE, {"w"}) == []
     assert again.counts == {"w": 1}
     assert torch.equal(again.parameters["w"].data, weight.data)
-
-
-def test_average_of_a_new_part_starts_at_its_weights(tmp_path: Path) -> None:
-    old = WeightAverage({"a": nn.Parameter(torch.ones(1))}, 0.9)
-    old.update()
-    old.save(tmp_path)
-    new = WeightAverage({"a": nn.Parameter(torch.zeros(1)), "b": nn.Parameter(torch.full((1,), 3.0))}, 0.9)
-    assert new.restore(tmp_path / TRAINING_FILE, {"a", "b"}) == ["b"]
-    assert (new.counts, new.average["b"].item()) == ({"a": 1, "b": 0}, 3.0)
-    new.save(tmp_path)
-    again = WeightAverage(new.parameters, 0.9)
-    again.restore(tmp_path / TRAINING_FILE, {"a", "b"})
-    assert again.counts == {"a": 1, "b": 0}

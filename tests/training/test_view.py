@@ -15,7 +15,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.envs.observations import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.training.view import ViewOptions, write_view
+from lerobot_memobench.training.trainer import ViewOptions, write_view
 from tests.support.held_dataset import LENGTHS, STRETCHES, make_held_dataset
 
 STATE, SLOTS, IMAGE = "observation.state", "observation.environment_state", "observation.images.image"
@@ -64,8 +64,7 @@ def test_stretches_between_prompts_and_holds_are_episodes(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("obs_type", "seen"),
-    [(PIXELS, {STATE, IMAGE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, IMAGE})],
+    ("obs_type", "seen"), [(PIXELS, {STATE, IMAGE}), (OBJECTS, {STATE, SLOTS}), (BOTH, {STATE, SLOTS, IMAGE})]
 )
 def test_lerobot_finds_the_chosen_inputs(obs_type: str, seen: set[str], imaged: Path, tmp_path: Path) -> None:
     write_view(imaged, tmp_path / "view", ViewOptions(obs_type=obs_type))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from lerobot_memobench.board.submission import BOARD
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.jobs.start import prepare_process
+from lerobot_memobench.jobs.processes import prepare_process
 from tools.board.check import check_author, check_paths, read_board
 
 

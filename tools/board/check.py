@@ -20,14 +20,13 @@ from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import evidence_line
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
-from lerobot_memobench.envs.pacing import paused
+from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES
 from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
-from lerobot_memobench.policies.lerobot_config import tree_hash
+from lerobot_memobench.policies.checkpoint import tree_hash
+from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evidence import scene_and_variant
-from lerobot_memobench.tasks.failures import CUT_OFF, FAULTS
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
 from lerobot_memobench.tasks.task import REFERENTS, STANDARD, STRICT, Task
 from tools.board.submission import Submission, Submitted, read_submission
@@ -156,13 +155,13 @@ def _check_log(run: Submitted) -> None:
     for record in run.records:
         _check_record(run, record)
     if (problem := first_variant_mismatch(run.records)) is not None:
-        raise MemobenchError(f"{run.place}: another version drew the variants ({problem}); evaluate with this version")
+        raise MemobenchError(f"{run.folder}: another version drew the variants ({problem}); evaluate with this version")
 
 
 def _check_record(run: Submitted, record: Mapping[str, Any]) -> None:
     """Check one line: facts that logs of other tools omit, and an outcome that this task can have."""
     protocol = run.protocol
-    where = f"{run.place}: {record['task']}, episode {record['episode']}"
+    where = f"{run.folder}: {record['task']}, episode {record['episode']}"
     if lacking := [key for key in ("seed", "variant") if record.get(key) is None]:
         raise MemobenchError(f"{where} has no {lacking[0]}; evaluate with this version")
     task = get_task(record["task"]).variant(record["variant"])
@@ -225,9 +224,18 @@ def _conjuncts(formula: Formula, kinds: Any) -> set[Formula]:
     return {each for child in children(formula) for each in _conjuncts(child, kinds)}
 
 
+def _paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
+    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
+    chunk = replan_steps or 1
+    pause = -(-pause_steps // chunk) * chunk  # whole chunks
+    fewest, most = STEPS_BETWEEN_PAUSES
+    # A rollout may end in a pause.
+    return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
+
+
 def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mapping[str, Any]) -> None:
     steps = record.get("paused_steps")
-    possible = paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
+    possible = _paused(protocol["pause_steps"], protocol["replan_steps"], record.get("steps") or 0)
     expected: dict[str, Any] = {"paused_steps": steps if steps in possible else possible} if possible else {}
     if protocol["evidence"]:
         choice = record.get("choice")
@@ -244,7 +252,7 @@ def _check_inputs(run: Submitted) -> None:
     kind, settings = str(policy.get("type")), policy.get("settings", {})
     claimed = {*str(run.protocol.get(INPUTS)).split(", ")}
     for part in claimed:
-        check_choice(f"{run.place}: {INPUTS}", part, KNOWN_INPUTS)
+        check_choice(f"{run.folder}: {INPUTS}", part, KNOWN_INPUTS)
     features = [*_block(settings.get("input_features")).values()]
     types = {str(_block(each).get("type")) for each in features} & {"VISUAL", "ENV"}
     detector = settings.get("detector")
@@ -257,7 +265,7 @@ def _check_inputs(run: Submitted) -> None:
         needed = {SIMULATOR}
     if claimed - drawn - objects - {SIMULATOR, NO_INPUT} or needed - claimed:
         raise MemobenchError(
-            f"{run.place}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
+            f"{run.folder}: inputs are {run.protocol[INPUTS]!r} on the card with obs_type={obs_type} and the policy "
             f"{kind} of {' and '.join(sorted(types)) or 'unknown'} features; expected {needed or drawn | objects}"
         )
 
@@ -278,7 +286,7 @@ def _check_policy(run: Submitted) -> None:
     there, checkpoint = run.card[POLICY].get("sha256"), run.card["checkpoint"] or {}
     if there != (tree_hash(checkpoint["files"]) if checkpoint.get("files") else None):
         raise MemobenchError(
-            f"{run.place}: the policy's sha256 {str(there)[:12]} is not that of the checkpoint's files on the card; "
+            f"{run.folder}: the policy's sha256 {str(there)[:12]} is not that of the checkpoint's files on the card; "
             "submit the card unchanged"
         )
 
@@ -294,17 +302,18 @@ def _check_scenes(runs: Sequence[Submitted]) -> None:
         version = run.protocol[SCENE_HASHES]
         if version > SCENE_HASH_VERSION:
             raise MemobenchError(
-                f"{run.place}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this version"
+                f"{run.folder}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this "
+                "version"
             )
         simulator = run.card["runs"][-1]["versions"].get("mujoco"), version
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])
             scene, seed = str(record.get("scene_hash")), record["seed"]
-            of_seed, at = scenes.setdefault((kind, seed), (scene, run.place))
-            of_scene, there = seeds.setdefault((kind, scene), (seed, run.place))
+            of_seed, at = scenes.setdefault((kind, seed), (scene, run.folder))
+            of_scene, there = seeds.setdefault((kind, scene), (seed, run.folder))
             if not SCENE.fullmatch(scene) or (of_seed, of_scene) != (scene, seed):
                 raise MemobenchError(
-                    f"{run.place}: {record['task']}, episode {record['episode']} has the scene {scene[:20]!r} of seed "
+                    f"{run.folder}: {record['task']}, episode {record['episode']} has the scene {scene[:20]!r} of seed "
                     f"{seed}; {at} has {of_seed[:20]!r} for this seed, and {there} this scene for {of_scene}; expected "
                     "hashes of 16 digits, equal for equal seeds only: one of these folders was changed"
                 )
@@ -333,7 +342,7 @@ def _check_original(submission: Submission, other: Submission) -> None:
     mine, theirs = submission.evaluation, other.evaluation
     if mine.digest == theirs.digest or _copied(mine.records, theirs.records) > COPIED:
         raise MemobenchError(
-            f"{mine.place} has the episodes of the row {other.name!r}; expected an evaluation of its own"
+            f"{mine.folder} has the episodes of the row {other.name!r}; expected an evaluation of its own"
         )
 
 

@@ -15,9 +15,10 @@ from pathlib import Path
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.evaluation_file import INPUTS
-from lerobot_memobench.evaluation.comparison import Contrast, compare_evaluations
+from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, stand_ins_of
+from lerobot_memobench.evaluation.statistics import Contrast
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
 from lerobot_memobench.untrusted import checked, parsed
 from tools.board.check import RERUNS, ranked, read_board
@@ -73,10 +74,10 @@ def board_row(
 ) -> BoardRow:
     """Return the row of a checked submission; ``others`` may hold its partner without a memory."""
     evaluation, controls = submission.evaluation, submission.controls
-    protocol, run = evaluation.protocol, evaluation.run
+    protocol = evaluation.protocol
     changes: Sequence[Contrast] = ()
     if PAUSES in controls:
-        changes = compare_evaluations(run, controls[PAUSES].run, permutations=100).contrasts
+        changes = compare_evaluations(evaluation, controls[PAUSES], permutations=100).contrasts
     partner = next((each for each in others if each.name == submission.about.without_memory), None)
     return BoardRow(
         name=submission.name,
@@ -84,14 +85,14 @@ def board_row(
         ranked=ranked(evaluation),
         rerun=(reruns or {}).get(submission.name) == submission.digest,
         suite=" ".join([protocol["suite"], *(["random referents"] if protocol["referent"] == "random" else [])]),
-        assets=f"LIBERO{', own objects for missing scans' if stand_ins_of(run.records) else ''}",
+        assets=f"LIBERO{', own objects for missing scans' if stand_ins_of(evaluation.records) else ''}",
         inputs=protocol[INPUTS],
         seeds=SEEDS[protocol["seed_base"]],
         episodes=protocol["episodes"],
-        rates=run.summary.average,
-        evidence=run.evidence.average if run.evidence else None,
+        rates=evaluation.summary.average,
+        evidence=evaluation.evidence.average if evaluation.evidence else None,
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
-        without_memory=None if partner is None else partner.evaluation.run.summary.average["SR"],
+        without_memory=None if partner is None else partner.evaluation.summary.average["SR"],
     )
 
 

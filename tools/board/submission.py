@@ -12,10 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, LOG, About, Evaluation, row_name
+from lerobot_memobench.board.submission import ABOUT, CARD, CONTROLS, LOG, About, row_name
 from lerobot_memobench.envs.episode_log import EpisodeRecord, joined, key_of
-from lerobot_memobench.envs.evaluation_file import read_evaluation
+from lerobot_memobench.envs.evaluation_file import POLICY, read_evaluation
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.io import in_words
 from lerobot_memobench.untrusted import Malformed, checked, parsed
 
@@ -25,8 +26,8 @@ LARGEST_UNPACKED = 8 << 20
 """Largest unpacked size of a log, bytes: some ten thousand episodes."""
 
 
-@dataclass(frozen=True)
-class Submitted(Evaluation):
+@dataclass(frozen=True, kw_only=True)
+class Submitted(Run):
     """An evaluation of a submission.
 
     Attributes:
@@ -79,7 +80,15 @@ def _read_evaluation(folder: Path, folders: Sequence[str] = ()) -> Submitted:
     content = _unpacked(folder / LOG)
     json.loads((folder / CARD).read_bytes(), object_pairs_hook=_once)
     records = joined(folder, card, _lines(folder / LOG, content))
-    return Submitted(folder, card, records, hashlib.sha256(content).hexdigest())
+    return Submitted(
+        name=folder.name,
+        method="",
+        folder=folder,
+        card=card,
+        records=records,
+        protocol={**card["protocol"], POLICY: card[POLICY]},
+        digest=hashlib.sha256(content).hexdigest(),
+    )
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -13,12 +13,13 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
-from lerobot_memobench.board.submission import PAUSES, Evaluation
+from lerobot_memobench.board.submission import PAUSES
 from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
 from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.evaluation_file import POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.rollouts.card import PACKAGES
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
@@ -39,51 +40,55 @@ REQUIRED = {
 """Package -> its versions under which this package runs."""
 
 
-def check_evaluation(run: Evaluation, *, part: bool = False, control: str = "") -> None:
-    """Check an evaluation: settings, episodes, seeds, versions. The error names the first rule that it breaks.
+def check_evaluation(run: Run, *, part: bool = False, control: str = "") -> None:
+    """Check an evaluation, or a ``control`` of `CONTROL_SETTING`; the error names the first rule that it breaks.
 
-    Args:
-        part: whether any tasks of the suite, and any number of their episodes, are enough.
-        control: name of the control that it is, of `CONTROL_SETTING`.
+    Of a ``part``, any tasks of the suite, and any number of their episodes, are enough.
     """
     _check_settings(run, **CONTROL_SETTING.get(control, {}))
     names = run.protocol["tasks"] if part else task_names(suite=run.protocol["suite"])
     _check_extent(run, names, 1 if part else FEWEST)
     _check_versions(run, names)
-    _check_salt(run)
+    if (SEEDS[run.protocol["seed_base"]] == SEALED) != bool(run.protocol["salt"]):
+        raise MemobenchError(
+            f"{run.folder} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
+            "others: evaluate them by `memobench test-sealed`"
+        )
 
 
-def check_control(run: Evaluation, control: Evaluation, name: str, *, part: bool = False) -> None:
+def check_control(run: Run, control: Run, name: str, *, part: bool = False) -> None:
     """Check an evaluation under a control as `check_evaluation` does, and that policy and settings are the same."""
     check_evaluation(control, part=part, control=name)
     for key in ("type", "sha256", "settings"):
         of_run, of_control = (evaluation.card[POLICY].get(key) for evaluation in (run, control))
         if of_run != of_control:
-            raise MemobenchError(f"{control.place} is of another policy ({key} differs); evaluate the same checkpoint")
+            raise MemobenchError(f"{control.folder} is of another policy ({key} differs); evaluate the same checkpoint")
     if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
-        raise MemobenchError(f"{run.place} and {control.place} differ in {unlike[0]}; evaluate with the same settings")
+        raise MemobenchError(
+            f"{run.folder} and {control.folder} differ in {unlike[0]}; evaluate with the same settings"
+        )
 
 
-def _check_settings(run: Evaluation, **control: Any) -> None:
+def _check_settings(run: Run, **control: Any) -> None:
     protocol = run.protocol
     if protocol["suite"] not in (PUBLISHED, STRICT):
         raise MemobenchError(
-            f"{run.place}: found suite={protocol['suite']}; the board is of memory tasks, published or strict"
+            f"{run.folder}: found suite={protocol['suite']}; the board is of memory tasks, published or strict"
         )
     try:
         board = EnvSettings(**{key: protocol[key] for key in MAY_DIFFER if key in protocol}, **control)
     except MemobenchError as error:
-        raise MemobenchError(f"{run.place}: {error}") from None
+        raise MemobenchError(f"{run.folder}: {error}") from None
     fixed = {key: value for key, value in board.protocol_block.items() if key not in MAY_DIFFER}
     if missing := sorted({*fixed, *MAY_DIFFER} - {*protocol}):
         raise MemobenchError(
-            f"{run.place}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
+            f"{run.folder}: the card's protocol lacks {', '.join(missing)}; submit a card of `lerobot eval`"
         )
     if unlike := differences(protocol, fixed, ignore=MAY_DIFFER):
-        raise MemobenchError(f"{run.place}: {unlike[0]} on the board; evaluate with the value of the board")
+        raise MemobenchError(f"{run.folder}: {unlike[0]} on the board; evaluate with the value of the board")
 
 
-def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
+def _check_extent(run: Run, names: Sequence[str], fewest: int) -> None:
     """Check that the log holds each episode of each task once, from the first seed of a split on."""
     protocol, seed = run.protocol, run.card[POLICY].get("seed")
     count, base, most = protocol["episodes"], protocol["seed_base"], MOST
@@ -91,12 +96,12 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
         fewest, most = max((len(get_task(name).random_variants) for name in names), default=1), EVIDENCE_EPISODES
     if base not in list(SEEDS) or seed != base:
         raise MemobenchError(
-            f"{run.place}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
+            f"{run.folder}: the first episode has the seed {seed}; expected {' or '.join(map(str, SEEDS))}, the first "
             "of the seeds that count"
         )
     if not fewest <= count <= most or sorted(protocol["tasks"]) != sorted(names):
         raise MemobenchError(
-            f"{run.place}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
+            f"{run.folder}: the protocol has {count} episodes of {len({*names}.intersection(protocol['tasks']))} of "
             f"{len(names)} tasks; expected {fewest} to {most} episodes of each"
         )
     requested = set(itertools.product(names, range(count)))
@@ -104,40 +109,32 @@ def _check_extent(run: Evaluation, names: Sequence[str], fewest: int) -> None:
     for task, episode in sorted(requested ^ logged)[:1]:
         problem = "is missing in the log" if (task, episode) in requested else "is not part of the protocol"
         raise MemobenchError(
-            f"{run.place}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
+            f"{run.folder}: {task[:80]}, episode {episode}, {problem}; expected {count} rollouts of each of the "
             f"{len(names)} tasks"
         )
 
 
-def _check_versions(run: Evaluation, names: Sequence[str]) -> None:
+def _check_versions(run: Run, names: Sequence[str]) -> None:
     for package in PACKAGES[:3]:  # this one, LeRobot and MuJoCo
-        versions = {start["versions"].get(package) for start in run.card["runs"]}
+        versions = {str(start["versions"].get(package)) for start in run.card["runs"]}
         if len(versions) > 1:
             raise MemobenchError(
-                f"{run.place}: its parts ran under {package} {' and '.join(sorted(map(str, versions)))}; evaluate "
-                "again with one version"
+                f"{run.folder}: its parts ran under {package} {' and '.join(sorted(versions))}; evaluate again with "
+                "one version"
             )
-        for version in map(str, versions):
-            try:
-                fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
-            except InvalidVersion:
-                fits = False
-            if not fits:
-                raise MemobenchError(
-                    f"{run.place}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
-                )
+        (version,) = versions
+        try:
+            fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+        except InvalidVersion:
+            fits = False
+        if not fits:
+            raise MemobenchError(
+                f"{run.folder}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
+            )
     for name in names:
         here, stored = task_hash(get_task(name)), run.card["task_files"].get(name)
         if here != stored:
             raise MemobenchError(
-                f"{run.place}: the files of {name} have the hash {str(stored)[:16]} on the card and {here} in this "
+                f"{run.folder}: the files of {name} have the hash {str(stored)[:16]} on the card and {here} in this "
                 "version; evaluate with this version"
             )
-
-
-def _check_salt(run: Evaluation) -> None:
-    if (SEEDS[run.protocol["seed_base"]] == SEALED) != bool(run.protocol["salt"]):
-        raise MemobenchError(
-            f"{run.place} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
-            "others: evaluate them by `memobench test-sealed`"
-        )

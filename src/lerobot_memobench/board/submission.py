@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
-import io
 import re
 import shutil
 import unicodedata
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from lerobot_memobench.envs.episode_log import MERGED_FILE, joined, log_text, read_lines
+from lerobot_memobench.envs.episode_log import MERGED_FILE, log_text
 from lerobot_memobench.envs.evaluation_file import (
     EVALUATION_FILE,
-    POLICY,
     has_evaluation,
     read_evaluation,
+    require_whole,
     write_evaluation,
 )
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import Run, requested
+from lerobot_memobench.evaluation.records import Run, read_run
 from lerobot_memobench.evaluation.report import evaluation_markdown
 from lerobot_memobench.io import refuse_links, write_file
 from lerobot_memobench.untrusted import PACKED
@@ -44,17 +42,17 @@ ABOUT = "submission"
 
 # --- the block ---
 
+# Windows cannot have files with names of devices.
 ROW_NAME = re.compile(r"(?!(con|prn|aux|nul|com\d|lpt\d)$)[a-z0-9][a-z0-9_-]{1,63}")
-"""Without the names of devices in Windows."""
 TEXT = re.compile(r"[\w(][\w .,:;+()/%~–-]{0,199}")
 FIRST_DAY = "2026-01-01"
+# Alphabets with letters of one shape: a word that mixes them imitates another name.
 LOOK_ALIKE = {"LATIN", "CYRILLIC", "GREEK"}
-"""Alphabets with letters of one shape; a word that mixes them imitates another name."""
 ACCOUNT = re.compile(r"@[A-Za-z0-9-]{1,39}")
+# Without look-alike hosts (IDNA) and paths that lead elsewhere.
 LINK = re.compile(
     r"https://(?!(.*\.)?xn--|.*/(\.|%2e){1,2}(/|$))[A-Za-z0-9.-]+(/[\w.~/%+@=-]*)?", re.ASCII | re.IGNORECASE
 )
-"""Without look-alike hosts (IDNA) and paths that lead elsewhere."""
 
 
 def row_name(name: str) -> str:
@@ -64,19 +62,14 @@ def row_name(name: str) -> str:
     return name
 
 
-def _alphabets(word: str) -> set[str]:
-    return {unicodedata.name(letter, "").split(" ")[0] for letter in word if letter.isalpha()}
-
-
 def _text(value: str) -> str:
-    mixed = any(len(_alphabets(word) & LOOK_ALIKE) > 1 for word in re.findall(r"\w+", value.replace("π", "")))
+    # π0 and π0.5 are names of policies.
+    words = re.findall(r"\w+", value.replace("π", ""))
+    alphabets = [{unicodedata.name(letter, "").split(" ")[0] for letter in word if letter.isalpha()} for word in words]
+    mixed = any(len(each & LOOK_ALIKE) > 1 for each in alphabets)
     if not TEXT.fullmatch(value) or mixed or unicodedata.normalize("NFKC", value) != value:
         raise ValueError("expected 1 to 200 letters, words of one alphabet, digits, spaces and . , : ; + ( ) / % ~ - _")
     return value
-
-
-def _submitter(value: str) -> str:
-    return value if ACCOUNT.fullmatch(value) else _text(value)
 
 
 def _link(value: str) -> str:
@@ -94,9 +87,7 @@ def _day(value: str) -> str:
 
 RowName = Annotated[str, AfterValidator(row_name)]
 Text = Annotated[str, AfterValidator(_text)]
-Submitter = Annotated[str, AfterValidator(_submitter)]
-Link = Annotated[str, AfterValidator(_link)]
-Day = Annotated[str, AfterValidator(_day)]
+Submitter = Annotated[str, AfterValidator(lambda value: value if ACCOUNT.fullmatch(value) else _text(value))]
 LINKS = ("code", "weights", "paper")
 
 
@@ -115,63 +106,27 @@ class About(BaseModel):
 
     model: Text
     submitter: Submitter
-    date: Day
+    date: Annotated[str, AfterValidator(_day)]
     training_data: Text
     parameters: Annotated[int, Ge(0), Le(10**13)] | None = None
-    links: dict[Literal["code", "weights", "paper"], Link] = {}
+    links: dict[Literal["code", "weights", "paper"], Annotated[str, AfterValidator(_link)]] = {}
     without_memory: RowName | None = None
 
 
-# --- reading ---
+# --- files ---
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """An evaluation of a submission.
-
-    Attributes:
-        place: folder, as messages name it.
-        records: its episodes, see `episode_log.joined`.
-    """
-
-    place: Path
-    card: Mapping[str, Any]
-    records: Sequence[Mapping[str, Any]]
-
-    @property
-    def protocol(self) -> dict[str, Any]:
-        """The protocol of the card."""
-        protocol: dict[str, Any] = self.card["protocol"]
-        return protocol
-
-    @property
-    def run(self) -> Run:
-        """The evaluation as reports read it."""
-        return Run(self.place.name, "", self.place, self.records, {**self.protocol, POLICY: self.card[POLICY]})
-
-
-def own_evaluation(folder: Path) -> Evaluation:
-    """Return a finished evaluation of the user, without episodes that its card does not ask for.
-
-    Raises:
-        MemobenchError: it lacks its card, or a line of its log contradicts the card.
-    """
-    card = read_evaluation(folder, whole=True)
-    return Evaluation(folder, card, requested(card, joined(folder, card, read_lines(folder))))
-
-
-# --- writing ---
+def own_evaluation(folder: Path) -> Run:
+    """Return a finished evaluation of the user; raise where its card lacks something that a repetition needs."""
+    run = read_run(folder)
+    require_whole(folder, run.card)
+    return run
 
 
 def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]) -> Path:
-    """Write the folder of a submission, and return it. An earlier submission there is replaced.
+    """Write the folder of a submission, named after its row, and return it. An earlier submission is replaced.
 
-    Args:
-        folder: its last part is the name of the row.
-        evaluations: "" for the evaluation itself, or a name of `CONTROLS` -> folder of a finished evaluation.
-
-    Raises:
-        MemobenchError: an evaluation lacks its card or its log, or the folder holds something else.
+    ``evaluations`` maps "" for the evaluation itself, or a name of `CONTROLS`, to the folder of a finished one.
     """
     if folder.exists() and not (has_evaluation(folder) and ABOUT in read_evaluation(folder)):
         raise MemobenchError(f"{folder} exists and holds no submission; choose another --out or --name")
@@ -183,10 +138,8 @@ def write_submission(folder: Path, about: About, evaluations: Mapping[str, Path]
         evaluation = own_evaluation(source)
         block = {} if control else {ABOUT: about.model_dump(exclude_none=True)}
         write_evaluation(target, {**evaluation.card, **block})
-        packed = io.BytesIO()
-        with gzip.GzipFile(fileobj=packed, mode="wb", mtime=0) as file:  # equal logs, equal files
-            file.write(log_text(evaluation.records).encode())
-        write_file(target / LOG, packed.getvalue())
+        # Without its time, so that equal logs are equal files.
+        write_file(target / LOG, gzip.compress(log_text(evaluation.records).encode(), mtime=0))
     return folder
 
 
@@ -200,8 +153,8 @@ PROMISES = (
 """Statements of a submitter that no program can check; template and form ask for the same."""
 
 
-def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
-    """Return the text in Markdown: files, statements of the submitter, promises to confirm, the evaluation's report."""
+def pull_request(name: str, about: About, evaluation: Run) -> str:
+    """Return the text in Markdown, with promises to confirm and the evaluation's report."""
     stated = about.model_dump(exclude_none=True)
     stated |= stated.pop("links")
     lines = [
@@ -214,6 +167,6 @@ def pull_request(name: str, about: About, evaluation: Evaluation) -> str:
         "",
         *(f"- [ ] {promise}" for promise in PROMISES),
         "",
-        evaluation_markdown(evaluation.run),
+        evaluation_markdown(evaluation),
     ]
     return "\n".join(lines)

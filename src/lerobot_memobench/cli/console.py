@@ -20,14 +20,10 @@ from rich.table import Table
 
 from lerobot_memobench.errors import MemobenchError, came_through, chain
 from lerobot_memobench.io import disk_refusal
-from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal
-from lerobot_memobench.jobs.start import prepare_process, reader_has_left
+from lerobot_memobench.jobs.processes import adding_resume_hint, lock_refusal, prepare_process, reader_has_left
 from lerobot_memobench.tasks.task import LiberoSuite, Suite
 
 USAGE_ERROR = 2
-
-WITH_PARENT = "--with-parent"
-"""First argument of a `lerobot` process that ends when its standard input closes, with the process that started it."""
 
 #: Columns when the output is not a terminal: task names are long, and a log file has no edge.
 WIDTH_OF_A_FILE = 140
@@ -45,7 +41,7 @@ SuiteOption = Annotated[
     ),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="Processes.")]
-AsJson = typer.Option("--json", help="Print JSON.")
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
 def console() -> Console:
@@ -57,7 +53,7 @@ def console() -> Console:
 
 
 def table(*columns: str, right: Collection[str] = (), **settings: Any) -> Table:
-    """Return a table without rows; columns of numbers are set flush ``right``."""
+    """Return a table without rows; columns of numbers are flush ``right``."""
     result = Table(header_style="bold", pad_edge=False, title_justify="left", **settings)
     for name in columns:
         result.add_column(name, justify="right" if name in right else "left", overflow="fold")
@@ -95,13 +91,11 @@ class Count:
         self._progress, self._bar = progress, progress.add_task(unit, total=total)
 
     def __call__(self, done: int, total: int, what: str = "", *, trouble: str | None = None, found: int = 0) -> None:
-        """Show that ``done`` of ``total`` pieces of work are done.
+        """Show that ``done`` of ``total`` pieces of work are done, ``found`` of them by an earlier run.
 
-        Args:
-            what: name of the newest piece; "" prints no line. trouble: its failure, printed on a terminal as well.
-            found: pieces that an earlier run has done; they are left out of the speed.
+        ``what``: name of the newest piece; "" prints no line. ``trouble``: its failure, printed on a terminal as well.
         """
-        if done <= found:
+        if done <= found:  # they are left out of the speed
             self._progress.reset(self._bar, total=total, completed=done)
         else:
             self._progress.update(self._bar, total=total, completed=done)
@@ -124,20 +118,13 @@ class Count:
 @contextmanager
 def counting(screen: Console, unit: str, total: int | None = None) -> Iterator[Count]:
     """Show the progress of a run; call the yielded `Count` after every piece of work."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    bar = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    columns = (*bar, TimeElapsedColumn(), TimeRemainingColumn())
     quiet = not screen.is_terminal
     with Progress(*columns, console=screen, disable=quiet, speed_estimate_period=SPEED_PERIOD) as progress:
         yield Count(progress, unit, total)
 
 
-BACKBONE = "policy.pretrained_backbone_weights"
-"""The weights of the torchvision backbone in LeRobot's policies such as act and diffusion."""
 FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
 """Errors of torch where it cannot fetch weights."""
 
@@ -152,15 +139,13 @@ def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str
 def run_command(call: Callable[[], object], program: str, again: str) -> int:
     """Run a command; return the exit status. A user's mistake is one line on stderr, status 2.
 
-    Args:
-        program: as it is typed, such as ``memobench``.
-        again: how to resume, printed when SIGTERM ends it or a worker process is killed.
+    ``again``: how to resume, printed when SIGTERM ends it or a worker process is killed.
     """
     try:
         prepare_process()
         with adding_resume_hint(program, lambda: again):
             result = call()
-            sys.stdout.flush()
+            sys.stdout.flush()  # here, not when Python exits, so that its errors become a sentence too
     except (typer.Abort, KeyboardInterrupt):
         return 130  # as shells do after Ctrl-C
     except typer.Exit as stop:
@@ -168,7 +153,8 @@ def run_command(call: Callable[[], object], program: str, again: str) -> int:
     except Exception as error:
         if isinstance(error, BrokenPipeError) and reader_has_left():
             return 1
-        message: Callable[[], str] | None = getattr(error, "format_message", None)  # click's usage errors
+        # Newer typer contains its own copy of click, so click's usage errors are recognised by their method.
+        message: Callable[[], str] | None = getattr(error, "format_message", None)
         if message is not None and type(error).__name__ == "NoArgsIsHelpError":  # a group without a command: its help
             print(message())
             return 0
@@ -204,7 +190,8 @@ def one_sentence(error: BaseException) -> str | None:
     if fetched is not None and came_through(fetched, "torch.hub"):
         return (
             f"the pretrained weights of a backbone are not on this machine and could not be fetched "
-            f"({_line(fetched)[:200]}); {BACKBONE}=null begins with random ones, which a checkpoint replaces"
+            f"({_line(fetched)[:200]}); policy.pretrained_backbone_weights=null begins with random ones, which a "
+            "checkpoint replaces"
         )
     import httpx
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled

@@ -61,7 +61,6 @@ def generate(
             f"--suite {suite}: LIBERO's tasks have no scripted expert, so no demonstrations can be made; its own are "
             "the dataset lerobot/libero"
         )
-    options: dict[str, Any] = {} if repo_id is None else {"repo_id": repo_id}
     chosen = [get_task(name) for name in resolve_tasks(tasks, suite)]
     from lerobot_memobench.datasets.generate import episodes_of
     from lerobot_memobench.datasets.generate import generate as run
@@ -90,7 +89,7 @@ def generate(
             finish=finish,
             progress=advance,
             notify=partial(screen.print, soft_wrap=True),
-            **options,
+            **({} if repo_id is None else {"repo_id": repo_id}),
         )
     rows = table("task", "solved", "of", "frames", "mean length", right=("solved", "of", "frames", "mean length"))
     for name in summary.tasks:
@@ -169,7 +168,7 @@ def cache(
     ] = None,
 ) -> None:
     """Encode a dataset once for policies with a memory. Its frames and its subgoals."""
-    from lerobot_memobench.policies.lerobot_config import check_device, quiet
+    from lerobot_memobench.policies.checkpoint import check_device, quiet
     from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
     from lerobot_memobench.training.features import cache_dataset
 
@@ -211,7 +210,7 @@ def view(
 ) -> None:
     """Write a dataset for lerobot-train. Without prompt and held frames, and with columns of chosen inputs."""
     from lerobot_memobench.datasets.episodes import read_info
-    from lerobot_memobench.training.view import view_options, write_view
+    from lerobot_memobench.training.trainer import view_options, write_view
 
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
@@ -222,11 +221,7 @@ def view(
     say(f"view: {out}")
 
 
-def validate(
-    folder: Finished,
-    workers: Workers = 1,
-    suite: OfSuite = None,
-) -> int:
+def validate(folder: Finished, workers: Workers = 1, suite: OfSuite = None) -> int:
     """Replay every episode and read every file to its end.
 
     The first disagreement of each is reported, and files that were written again.

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from lerobot_memobench.cli.console import WITH_PARENT, as_path, console, counting, note, run_command, say
+from lerobot_memobench.cli.console import as_path, console, counting, note, run_command, say
 from lerobot_memobench.commands.command_line import (
     CONFIG_FILE,
     HELP,
@@ -31,13 +31,14 @@ from lerobot_memobench.commands.command_line import (
     SHORT_FORMS,
     TYPE,
     as_command_line,
+    call_lerobot,
     check_names,
     is_of_benchmark,
+    lerobot_commands,
     parse_words,
     read_words,
     without,
 )
-from lerobot_memobench.commands.lerobot_commands import call_lerobot, lerobot_commands
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.io import explaining_disk_errors
@@ -51,6 +52,8 @@ if TYPE_CHECKING:
     from lerobot_memobench.jobs.processes import Advance
     from lerobot_memobench.rollouts.plan import EvaluationPlan
 
+WITH_PARENT = "--with-parent"
+"""First argument of a process that ends when its standard input closes, with the process that started it."""
 SHARD_PROGRAM = ("-m", "lerobot_memobench.cli.lerobot", WITH_PARENT)
 """Arguments of Python that start the process of one part."""
 
@@ -121,9 +124,9 @@ def evaluate(words: Mapping[str, str]) -> int:
     suites = check_tasks(words)
     if len(suites) > 1:
         return evaluate_suites(suites, words)
-    from lerobot_memobench.rollouts.plan import plan_words
+    from lerobot_memobench.rollouts.plan import plan_line
 
-    plan = plan_words(words)
+    plan = plan_line(as_command_line(words))
     hint = f"resume with: {plan.resuming_command}"
     with (
         adding_resume_hint("lerobot", lambda: hint),
@@ -171,11 +174,7 @@ def check_tasks(words: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def flags_of_other(words: Mapping[str, str]) -> list[str]:
-    """Return LeRobot's flags for an evaluation of another environment than the benchmark.
-
-    Raises:
-        MemobenchError: no environment is named, an option is the benchmark's, or the checkpoint is not complete.
-    """
+    """Return LeRobot's flags for an evaluation of another environment than the benchmark."""
     from lerobot_memobench.policies.checkpoint import check_checkpoint
 
     for key in words:
@@ -222,7 +221,7 @@ def evaluate_in_parts(plan: EvaluationPlan) -> int:
 
 def print_report(run: Run) -> int:
     """Print a report; return 1 when episodes that were asked for are missing."""
-    from lerobot_memobench.evaluation.headline import headline
+    from lerobot_memobench.evaluation.records import headline
     from lerobot_memobench.evaluation.report import REPORT_MARKDOWN, failure_line, rates_table
     from lerobot_memobench.evaluation.tables import terminal_table
 

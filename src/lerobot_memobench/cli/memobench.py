@@ -11,6 +11,7 @@ import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,13 +32,13 @@ from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     get_task,
     load_task,
+    longest_cue_to_use,
     suite_of,
     task_folder,
     task_names,
     task_number,
     task_record,
 )
-from lerobot_memobench.tasks.gap import longest_gap
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED, Task
 
 if TYPE_CHECKING:
@@ -45,18 +46,15 @@ if TYPE_CHECKING:
 
     from lerobot_memobench.doctor import Finding
 
-COLOURS = {
-    **{"ok": "green", "warning": "yellow"},
-    **{"passed": "green", "failed": "red", "no memory": "yellow", "not checked": "yellow"},
-}
-"""Status of the doctor's findings, and outcome of a conformance check -> its colour."""
+COLOURS = {"ok": "green", "passed": "green", "failed": "red"}
+"""Status of a finding of the doctor, or outcome of a conformance check -> its colour; others are yellow."""
 
 
 # --- look around ---
 
 
 def tasks(
-    as_json: Annotated[bool, typer.Option("--json", help="Print everything about each task as JSON.")] = False,
+    as_json: AsJson = False,
     suite: SuiteOption = PUBLISHED,
     folder: Annotated[
         Path | None,
@@ -109,15 +107,13 @@ def task_table(tasks: Sequence[Task]) -> Table:
         if k and task.memory_type != tasks[k - 1].memory_type:
             rows.add_section()
         prompt = task.prompt.kind if task.prompt else ""
-        gap = str(longest_gap(task) or "")
+        gap = str(longest_cue_to_use(task) or "")
         number = str(task_number(task.name)) if known[k] else ""
         rows.add_row(number, task.name, task.memory_type, task.operations, gap, prompt, task.title)
     return rows
 
 
-def objects(
-    as_json: Annotated[bool, AsJson] = False,
-) -> None:
+def objects(as_json: AsJson = False) -> None:
     """Print the layout of object observations. Slots, the fields of each, the classes by index."""
     from lerobot_memobench.sim.object_layout import SLOTS
     from lerobot_memobench.sim.object_slots import layout
@@ -132,12 +128,8 @@ def objects(
     say("classes: " + ", ".join(f"{k} {name}" for k, name in enumerate(description["classes"])))
 
 
-def doctor(
-    as_json: Annotated[bool, AsJson] = False,
-) -> int:
+def doctor(as_json: AsJson = False) -> int:
     """Check that this machine can run the benchmark. Each problem comes with its fix."""
-    from dataclasses import asdict
-
     from lerobot_memobench.doctor import examine
 
     findings = examine()
@@ -155,7 +147,7 @@ def finding_table(findings: Sequence[Finding]) -> Table:
         detail = Text(finding.detail)
         if finding.fix:
             detail.append("\nfix: ", "bold").append(finding.fix)
-        rows.add_row(finding.what, Text(finding.status, COLOURS[finding.status]), detail)
+        rows.add_row(finding.what, Text(finding.status, COLOURS.get(finding.status, "yellow")), detail)
     return rows
 
 
@@ -215,9 +207,9 @@ def conformance(
         results = run_checks(subject)
     rows = table("check", "outcome", "", title=f"Conformance of {subject.name}")
     for result in results:
-        rows.add_row(result.check, Text(result.outcome, COLOURS[result.outcome]), result.sentence)
+        rows.add_row(result.check, Text(result.outcome, COLOURS.get(result.outcome, "yellow")), result.sentence)
     console().print(rows)
-    failed = [result.check for result in results if result.outcome is FAILED]
+    failed = [result.check for result in results if result.outcome == FAILED]
     say(f"failed: {', '.join(failed)}" if failed else "No check failed.")
     return 1 if failed else 0
 

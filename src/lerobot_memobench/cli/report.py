@@ -110,12 +110,14 @@ def compare(
 
     Evaluations that differ in the setting of a control (pauses, corrupted memory, interference, …) are reported as it.
     """
-    from lerobot_memobench.evaluation.comparison import compare_evaluations, comparison_csv, comparison_report
+    from lerobot_memobench.evaluation.comparison import compare_evaluations, comparison_report
     from lerobot_memobench.evaluation.records import read_runs
+    from lerobot_memobench.evaluation.tables import csv_text
 
     first, second = read_runs([a, b])
     comparison = compare_evaluations(first, second, allow=allow or (), seed=seed, permutations=permutations)
-    show_report(comparison_report(comparison), "compare", format_, out, comparison_csv(comparison))
+    compared = comparison_report(comparison)
+    show_report(compared, "compare", format_, out, csv_text(compared.data["differences"]))
 
 
 def merge(

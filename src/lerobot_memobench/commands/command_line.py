@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 import typing
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -26,13 +27,14 @@ from lerobot_memobench.errors import MemobenchError, chain, nearest
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
     check_checkpoint,
+    check_sizes,
     checkpoint_folder,
     checkpoint_settings,
     checkpoint_type,
     looks_local,
+    quiet,
     shipped_policies,
 )
-from lerobot_memobench.policies.lerobot_config import check_sizes, quiet
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -134,8 +136,6 @@ def is_of_benchmark(words: Mapping[str, str]) -> bool:
 class CommandSettings:
     """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
 
-    Changes return another object.
-
     Attributes:
         config: the command's configuration class.
         words: LeRobot's full name of each setting on the command line -> its text or value.
@@ -176,11 +176,7 @@ class CommandSettings:
 
 
 def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
-    """Return the settings that the words of ``lerobot eval`` or ``lerobot train`` ask for.
-
-    Raises:
-        MemobenchError: a choice, a recipe or a short form cannot be used, or the configuration file not be read.
-    """
+    """Return the settings that the words of ``lerobot eval`` or ``lerobot train`` ask for."""
     from lerobot.configs.eval import EvalPipelineConfig
     from lerobot.configs.train import TrainPipelineConfig
 
@@ -216,7 +212,10 @@ def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
         # replan= sets the policy's interval and the environment's, for the log; either may not exist.
         kinds = {name: kind for name in short[key] if (kind := setting_kind(requested, name)) is not None}
         if not kinds:
-            raise _without_field(requested, key, short[key][0])
+            section, _, name = short[key][0].partition(".")
+            if (chosen := class_of_section(requested, section)) is None:
+                raise MemobenchError(f"{key}= sets {name} of the {section}: name one with {section}=")
+            raise MemobenchError(f"{key}= sets {section}.{name}, and {chosen.__name__} has no such field")
         full |= {name: value_of(key, kind, value) for name, kind in kinds.items()}
     return replace(requested, words=full)
 
@@ -224,18 +223,14 @@ def read_words(command: str, words: Mapping[str, str]) -> CommandSettings:
 def setting_kind(requested: CommandSettings, key: str) -> Any:
     """Return the type of a setting of this full name, None where the choices that are made have none."""
     section, _, name = key.partition(".")
-    kind = without_none(field_types(requested.config)[section])
-    chosen = chosen_class(kind, section, requested.get(section) or {}) if is_choice_type(kind) else kind
+    chosen = class_of_section(requested, section)
     return None if chosen is None else field_types(chosen).get(name)
 
 
-def _without_field(requested: CommandSettings, key: str, full: str) -> MemobenchError:
-    section, _, name = full.partition(".")
-    kind = without_none(field_types(requested.config)[section])
-    chosen = chosen_class(kind, section, requested.get(section) or {})
-    if chosen is not None:
-        return MemobenchError(f"{key}= sets {full}, and {chosen.__name__} has no such field")
-    return MemobenchError(f"{key}= sets {name} of the {section}: name one with {section}=")
+def class_of_section(requested: CommandSettings, section: str) -> type | None:
+    """Return the class of a section's settings, None where its choice is not made."""
+    kind: Any = without_none(field_types(requested.config)[section])
+    return chosen_class(kind, section, requested.get(section) or {}) if is_choice_type(kind) else kind
 
 
 def nested(words: Mapping[str, Any]) -> Settings:
@@ -421,17 +416,14 @@ def read_config_file(config_path: str | None) -> Settings:
 
 
 def _begun_training(config: Any, config_path: str | None) -> Any:
-    """Return the configuration of the training whose checkpoint a ``config_path`` names, None where it names none.
-
-    LeRobot finds it in a folder or a repository, and converts settings of its earlier versions.
-    """
+    """Return the configuration of the training whose checkpoint a ``config_path`` names, None where it names none."""
     if config_path is None or not hasattr(config, "from_pretrained"):
         return None
     path = Path(config_path).expanduser()
     if path.is_file() and path.name != TRAIN_CONFIG:
         return None
     read_config_file(config_path)  # its errors name the file
-    with quiet():
+    with quiet():  # LeRobot converts settings of its earlier versions
         return config.from_pretrained(path if path.exists() else config_path)
 
 
@@ -456,7 +448,7 @@ def build_config(annotation: Any, settings: Any, key: str = "") -> Any:
 
 
 def _explained(error: Exception, key: str) -> MemobenchError:
-    """Return the innermost reason of draccus's chain of errors; the configurations' own errors stay as they are."""
+    # draccus wraps reasons in reasons: the innermost is the mistake. The configurations' own errors stay as they are.
     reasons = [reason for reason in chain(error) if not isinstance(reason, DecodingError | ParsingError)]
     own = next((reason for reason in reasons if isinstance(reason, MemobenchError)), None)
     if own is not None:
@@ -508,8 +500,10 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
     if isinstance(value, Mapping):
         if is_section:
             return typed(kind, value, f"{key}." if key else "")
-        if typing.get_origin(kind) is dict and any(isinstance(item, Mapping) for item in value.values()):
-            return _checked_mapping(key, kind, value)
+        inner = typing.get_args(kind)[1:] if typing.get_origin(kind) is dict else ()
+        if {*inner} & {*PLAIN, str} and any(isinstance(item, Mapping) for item in value.values()):
+            name = next(iter(value))
+            raise MemobenchError(f"found {key}.{name}=; {key} is one mapping: give {key}='{{\"{name}\": …}}'")
         if kind in (*PLAIN, str, Path) or is_literal(kind) or is_enum(kind):
             raise MemobenchError(f"there is no setting {f'{key}.{next(iter(value), "")}'!r}; {key} holds one value")
         return value
@@ -532,7 +526,10 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
     if not isinstance(value, str):
         return str(value) if kind is str and type(value) in (int, float) else value
     if is_literal(kind) or is_enum(kind):
-        return _listed(key, kind, value)
+        names = [str(choice) for choice in typing.get_args(kind)] or [*kind.__members__]
+        if value not in (*names, *(() if is_literal(kind) else (str(member.value) for member in kind))):
+            raise MemobenchError(f"{key}={value}: {nearest(value, names)}")
+        return value
     if kind in (str, Path):
         return value
     try:
@@ -545,27 +542,6 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
     if typing.get_origin(kind) is dict and not isinstance(content, dict):
         raise MemobenchError(f'{key}={value[:80]}: expected a mapping, such as {key}=\'{{"name": "other"}}\'')
     return value if isinstance(content, str) else content
-
-
-def _checked_mapping(key: str, kind: Any, value: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a mapping of mappings, where the values of a field may be mappings."""
-    inner = (typing.get_args(kind) or (str, Any))[1]
-    if inner in (*PLAIN, str):
-        name = next(iter(value))
-        raise MemobenchError(f"found {key}.{name}=; {key} is one mapping: give {key}='{{\"{name}\": …}}'")
-    return value
-
-
-def _listed(key: str, kind: Any, value: str) -> str:
-    """Return the value of a literal or an enumeration."""
-    if is_literal(kind):
-        known = names = [str(choice) for choice in typing.get_args(kind)]
-    else:
-        names = list(kind.__members__)
-        known = [*(str(member.value) for member in kind), *names]
-    if value not in known:
-        raise MemobenchError(f"{key}={value}: {nearest(value, names)}")
-    return value
 
 
 def field_types(kind: Any) -> dict[str, Any]:
@@ -602,3 +578,37 @@ def policy_config(requested: CommandSettings) -> PreTrainedConfig | None:
     if config is not None:
         check_sizes(config)
     return config
+
+
+# --- LeRobot's own commands ---
+
+COMMAND_PREFIX = "lerobot-"
+
+
+def lerobot_commands() -> dict[str, metadata.EntryPoint]:
+    """Return name -> entry point of every command of the installed LeRobot (``eval``: ``lerobot-eval``)."""
+    return {
+        entry.name.removeprefix(COMMAND_PREFIX): entry
+        for entry in metadata.distribution("lerobot").entry_points
+        if entry.group == "console_scripts" and entry.name.startswith(COMMAND_PREFIX)
+    }
+
+
+def call_lerobot(command: str, flags: Sequence[str]) -> int:
+    """Run ``lerobot-<command>`` with these flags; return its exit status. Its main function reads ``sys.argv``."""
+    try:
+        entry = lerobot_commands()[command].load()  # takes many seconds
+    except ImportError as error:  # LeRobot was installed without an extra
+        raise MemobenchError(f"{COMMAND_PREFIX}{command} needs a package that is not installed: {error}") from error
+    before = sys.argv
+    sys.argv = [f"{COMMAND_PREFIX}{command}", *flags]
+    try:
+        status = entry()
+    except SystemExit as stop:
+        status = stop.code
+    finally:
+        sys.argv = before
+    if status is None or isinstance(status, int):
+        return status or 0
+    print(status, file=sys.stderr)  # as Python does with such a status
+    return 1

@@ -11,13 +11,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 
 import numpy as np
 
 from lerobot_memobench.conformance.streams import Stream
 from lerobot_memobench.conformance.subject import Actions, Subject
+from lerobot_memobench.envs.observations import reads_prompt
 from lerobot_memobench.errors import MemobenchError
 
 PROBED = 12
@@ -32,39 +32,26 @@ number of rows in a batch and on the precision of the weights."""
 RESETS = "let reset() clear the history and the action queue of every row"
 BY_ROW = "keep a history and an action queue for each row, and begin and plan by that row's phase and step alone"
 
+PASSED, FAILED, NO_MEMORY, NOT_CHECKED = "passed", "failed", "no memory", "not checked"
 
-class CheckOutcome(StrEnum):
-    """How a check ended."""
-
-    PASSED = "passed"
-    FAILED = "failed"
-    NO_MEMORY = "no memory"
-    NOT_CHECKED = "not checked"
-
-
-PASSED, FAILED, NO_MEMORY, NOT_CHECKED = CheckOutcome
-
-CheckVerdict = tuple[CheckOutcome, str]
-"""An outcome and its sentence: the problem and its solution."""
+CheckVerdict = tuple[str, str]
+"""An outcome, and a sentence with the problem and its solution."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """Result of a check: its name, its outcome, and a sentence."""
+    """The verdict of a check."""
 
     check: str
-    outcome: CheckOutcome
+    outcome: str
     sentence: str
 
 
 class Behaviour:
     """Actions of a policy when frames are replaced, measured once for all checks.
 
-    Raise `MemobenchError` if the policy does not act at all.
-
-    Attributes:
-        one, two, three: the streams. A check looks at the row of ``one``.
-        alone: the actions (calls, A) of that stream in a batch of its own.
+    A check looks at the row of stream ``one``; ``alone``: its actions (calls, A) in a batch of its own. Raise
+    `MemobenchError` if the policy does not act at all.
     """
 
     def __init__(self, subject: Subject) -> None:
@@ -131,38 +118,23 @@ class Behaviour:
         """Largest difference of equal actions."""
         weights = next(self.subject.policy.parameters(), None)
         precise = weights is None or str(weights.dtype) == "torch.float32"
+        # Without a memory, the scale is that of changes from call to call.
         effect = self.memory or float(np.abs(self.alone - np.roll(self.alone, 1, axis=0)).max())
         return max(SHARE * effect, LEAST["float32" if precise else "other"])
 
     def differ(self, actions: Actions, other: Actions) -> int | None:
         """Return the first call at which actions differ, None if they are equal."""
         length = min(len(actions), len(other))
+        # Not `>`, so that NaN differs.
         calls = np.flatnonzero(~(np.abs(actions[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
-
-
-# --- the checks, in an order in which later ones rely on earlier ones ---
-
-Check = Callable[[Behaviour], CheckVerdict]
-CHECKS: dict[str, Check] = {}
-
-
-def check(name: str, *, of_memory: bool = False) -> Callable[[Check], Check]:
-    """Add a function to the checks; one ``of_memory`` is skipped for a policy without."""
-
-    def add(function: Check) -> Check:
-        def checked(behaviour: Behaviour) -> CheckVerdict:
-            return (NO_MEMORY, "it has no memory") if of_memory and not behaviour.memory else function(behaviour)
-
-        CHECKS[name] = checked
-        return function
-
-    return add
 
 
 def run_check(name: str, behaviour: Behaviour) -> Result:
     """Run one check."""
     try:
+        if name in OF_MEMORY and not behaviour.memory:
+            return Result(name, NO_MEMORY, "it has no memory")
         return Result(name, *CHECKS[name](behaviour))
     except Exception as error:  # any policy may raise anything
         return Result(name, FAILED, f"the policy raised {type(error).__name__}: {error}")
@@ -174,7 +146,9 @@ def run_checks(subject: Subject) -> list[Result]:
     return [run_check(name, behaviour) for name in CHECKS]
 
 
-@check("deterministic given a seed")
+# --- the checks ---
+
+
 def _is_deterministic(behaviour: Behaviour) -> CheckVerdict:
     from lerobot.utils.random_utils import set_seed
 
@@ -191,7 +165,6 @@ def _is_deterministic(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("reset forgets")
 def _reset_forgets(behaviour: Behaviour) -> CheckVerdict:
     before = []
     for stream in (behaviour.two.until(behaviour.two.start + 4), behaviour.three):
@@ -207,7 +180,6 @@ def _reset_forgets(behaviour: Behaviour) -> CheckVerdict:
     return PASSED, "an episode is the same after any other"
 
 
-@check("remembers")
 def _remembers(behaviour: Behaviour) -> CheckVerdict:
     if behaviour.memory:
         return PASSED, f"frames of the past change actions by up to {behaviour.memory:.2g}"
@@ -216,9 +188,8 @@ def _remembers(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("reads the prompt", of_memory=True)
 def _reads_the_prompt(behaviour: Behaviour) -> CheckVerdict:
-    if not behaviour.subject.reads_prompt:
+    if not reads_prompt(behaviour.subject.policy.config):
         return FAILED, (
             "it observes no prompt, because prompts are played inside reset: declare reads_prompt: ClassVar[bool] = "
             "True on the class of its configuration"
@@ -233,7 +204,6 @@ def _reads_the_prompt(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("plans after the prompt")
 def _plans_after_prompt(behaviour: Behaviour) -> CheckVerdict:
     if behaviour.one.start in behaviour.plans:
         return PASSED, "the first execution frame decides the first action"
@@ -243,16 +213,22 @@ def _plans_after_prompt(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("remembers every control step", of_memory=True)
 def _remembers_every_step(behaviour: Behaviour) -> CheckVerdict:
     subject, verdict = behaviour.subject, _remembers_between_plans(behaviour)
+    config = subject.policy.config
+    if verdict[0] != FAILED or not hasattr(config, "n_action_steps"):
+        return verdict
+    usual = config.n_action_steps
     # Where the interval divides a memory's stride, plans read frames of earlier plans alone; so any interval will do.
-    for steps in INTERVALS if verdict[0] is FAILED and hasattr(subject.policy.config, "n_action_steps") else ():
+    for steps in INTERVALS:
+        config.n_action_steps = steps
         # A policy may refuse an interval, such as one longer than its chunks.
-        with subject.planning_every(steps), contextlib.suppress(Exception):
+        with contextlib.suppress(Exception):
             other = _remembers_between_plans(Behaviour(subject))
-            if other[0] is PASSED:
-                return other
+            if other[0] == PASSED:
+                verdict = other
+                break
+    config.n_action_steps = usual
     return verdict
 
 
@@ -273,7 +249,6 @@ def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("rows are independent")
 def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
     roll, stream = behaviour.subject.roll, behaviour.one
     # The other rows begin at other steps.
@@ -286,7 +261,6 @@ def _rows_are_independent(behaviour: Behaviour) -> CheckVerdict:
     return PASSED, "a row acts alike alone and with other rows"
 
 
-@check("finished rows change no other")
 def _finished_rows_change_no_other(behaviour: Behaviour) -> CheckVerdict:
     over = behaviour.two.until(behaviour.two.start + 4)
     call = behaviour.differ(behaviour.subject.roll([over, behaviour.one])[:, 1], behaviour.after_two)
@@ -297,7 +271,6 @@ def _finished_rows_change_no_other(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("same history in training")
 def _same_history_in_training(behaviour: Behaviour) -> CheckVerdict:
     plans = sorted({*behaviour.plans, *behaviour.all_plans[-COMPARED:]})  # a hold may have thousands
     if not plans:
@@ -325,7 +298,6 @@ def _same_history_in_training(behaviour: Behaviour) -> CheckVerdict:
     )
 
 
-@check("needs_observation is true")
 def _needs_observation_is_true(behaviour: Behaviour) -> CheckVerdict:
     sparing = behaviour.subject.roll([behaviour.two, behaviour.one], sparing=True)[:, 1]
     call = behaviour.differ(sparing, behaviour.after_two)
@@ -335,3 +307,20 @@ def _needs_observation_is_true(behaviour: Behaviour) -> CheckVerdict:
         f"at call {call} it acts differently without frames that needs_observation() declared unnecessary: return "
         "True before every frame that is remembered or planned from"
     )
+
+
+CHECKS: dict[str, Callable[[Behaviour], CheckVerdict]] = {
+    "deterministic given a seed": _is_deterministic,
+    "reset forgets": _reset_forgets,
+    "remembers": _remembers,
+    "reads the prompt": _reads_the_prompt,
+    "plans after the prompt": _plans_after_prompt,
+    "remembers every control step": _remembers_every_step,
+    "rows are independent": _rows_are_independent,
+    "finished rows change no other": _finished_rows_change_no_other,
+    "same history in training": _same_history_in_training,
+    "needs_observation is true": _needs_observation_is_true,
+}
+"""Name -> check. Later ones rely on earlier ones."""
+OF_MEMORY = ("reads the prompt", "remembers every control step")
+"""Checks that are skipped for a policy without a memory."""

@@ -35,5 +35,5 @@ class MemoryConformance:
         result = run_check(check, behaviour)
         if result.outcome in (NO_MEMORY, NOT_CHECKED):
             pytest.skip(result.sentence)
-        if result.outcome is FAILED:
+        if result.outcome == FAILED:
             pytest.fail(result.sentence, pytrace=False)

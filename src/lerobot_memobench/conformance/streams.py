@@ -52,7 +52,6 @@ def task_of_texts(subgoals: Mapping[str, Sequence[str]]) -> str:
 
 
 def _episode(task: Task, seed: int, prompt: int, images: bool, frames: int) -> Demonstration:
-    """Return an episode with smooth random motions of an arm and some objects."""
     rng, length = np.random.default_rng(seed), prompt + frames
     count = len(task.checkpoints)
     completed = prompt + frames * np.arange(1, count + 1) // (count + 1)
@@ -85,7 +84,7 @@ def _episode(task: Task, seed: int, prompt: int, images: bool, frames: int) -> D
 
 
 def _images(rng: np.random.Generator, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return a coloured square that moves along positions (T, 2) in [-1, 1]."""
+    # a coloured square that moves along positions (T, 2) in [-1, 1]
     images = np.full((len(positions), IMAGE_SIZE, IMAGE_SIZE, 3), 40, np.uint8)
     side, colour = IMAGE_SIZE // 4, rng.integers(80, 255, 3)
     corners = ((positions + 1) / 2 * (IMAGE_SIZE - side)).astype(int)
@@ -134,15 +133,11 @@ class Stream:
 
 
 def read_streams(dataset: Any, images: bool, objects: str | None, prompts: bool, frames: int) -> Iterator[Stream]:
-    """Yield the beginning of each episode of a LeRobotDataset as a rollout observes it.
+    """Yield the beginning of each episode of a LeRobotDataset, without delta timestamps, as a rollout observes it.
 
-    Held frames are part of a memory's history in training; a policy that reads no prompt does not train on them.
-
-    Args:
-        dataset: without delta timestamps.
-        images: whether cameras are observed. objects: the observed column of object state, or None.
-        prompts: whether prompt and held frames are observed; prompted episodes of few frames come first.
-        frames: number of execution frames that are not held.
+    It has ``frames`` execution frames that are not held. ``objects``: the observed column of object state, or None.
+    With ``prompts``, prompt and held frames are observed (a memory's history in training has them, and a policy that
+    reads no prompt does not train on them), and prompted episodes of few frames come first.
     """
     from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
@@ -162,12 +157,12 @@ def read_streams(dataset: Any, images: bool, objects: str | None, prompts: bool,
         for index in indices:
             item = dataset[index] if images else dataset.hf_dataset[index]
             frame = {key: item[key] for key in (OBS_STATE, *CLOCK)}
-            frame |= {key: _as_float(item[key]) for key in item if images and key.startswith(f"{OBS_IMAGES}.")}
+            frame |= {key: as_float(item[key]) for key in item if images and key.startswith(f"{OBS_IMAGES}.")}
             frame |= {} if objects is None else {OBS_ENV_STATE: item[objects]}
             shown.append(frame)
         yield Stream(tuple(shown), task, indices)
 
 
-def _as_float(image: Tensor) -> Tensor:
+def as_float(image: Tensor) -> Tensor:
     """Return an image in [0, 1], as LeRobot's training loop gives it to a policy."""
     return image.to(torch.float32) / 255 if image.dtype == torch.uint8 else image

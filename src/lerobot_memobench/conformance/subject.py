@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,14 @@ from lerobot_memobench.commands.command_line import (
     read_words,
     setting_kind,
 )
-from lerobot_memobench.conformance.streams import EXECUTION_FRAMES, Stream, read_streams, task_of_texts, write_streams
+from lerobot_memobench.conformance.streams import (
+    EXECUTION_FRAMES,
+    Stream,
+    as_float,
+    read_streams,
+    task_of_texts,
+    write_streams,
+)
 from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
@@ -32,9 +39,8 @@ from lerobot_memobench.datasets.layout import objects_column
 from lerobot_memobench.envs.observations import obs_type_of, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.policies.checkpoint import check_weights
+from lerobot_memobench.policies.checkpoint import check_device, check_weights, quiet
 from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
-from lerobot_memobench.policies.lerobot_config import check_device, quiet
 from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
@@ -68,21 +74,6 @@ class Subject:
     cameras: list[str]
     numbers: NDArray[np.int64]
 
-    @property
-    def reads_prompt(self) -> bool:
-        """Whether its configuration declares that it reads prompts."""
-        return reads_prompt(self.policy.config)
-
-    @contextmanager
-    def planning_every(self, steps: int) -> Iterator[None]:
-        """Let it plan at another interval, in control steps."""
-        config, usual = self.policy.config, self.policy.config.n_action_steps
-        try:
-            config.n_action_steps = steps
-            yield
-        finally:
-            config.n_action_steps = usual
-
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.
 
@@ -96,7 +87,9 @@ class Subject:
         actions.reset()
         with EqualNoise() if equal_noise else nullcontext():
             for call in range(max(len(stream) for stream in streams)):
-                batch = self._batch(streams, call)
+                shown = [stream.at(call) for stream in streams]
+                batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in shown]) for key in shown[0]}
+                batch["task"] = [stream.task for stream in streams]
                 begins = any(call in (0, stream.start) for stream in streams)
                 costly = [key for key in batch if key.startswith(("observation.images", OBJECTS_COLUMN))]
                 if sparing and not begins and actions.has_planned_action():
@@ -108,19 +101,12 @@ class Subject:
                 answers.append(action.to("cpu", torch.float32).numpy().copy())
         return np.stack(answers)
 
-    def _batch(self, streams: Sequence[Stream], call: int) -> dict[str, Any]:
-        shown = [stream.at(call) for stream in streams]
-        batch: dict[str, Any] = {key: torch.stack([frame[key] for frame in shown]) for key in shown[0]}
-        return batch | {"task": [stream.task for stream in streams]}
-
     def predict(self, stream: Stream, calls: Sequence[int]) -> Actions:
         """Return the first actions (calls, A) of the chunks predicted for a training batch of these frames."""
         from lerobot.utils.collate import lerobot_collate_fn
 
         batch = lerobot_collate_fn([self.dataset[int(self.numbers[stream.indices[call]])] for call in calls])
-        for key in self.cameras:
-            if key in batch and batch[key].dtype == torch.uint8:
-                batch[key] = batch[key].to(torch.float32) / 255
+        batch |= {key: as_float(batch[key]) for key in self.cameras if key in batch}
         self.policy.reset()
         with EqualNoise(), torch.inference_mode():
             chunks = self.policy.predict_action_chunk(self.preprocessor(batch))
@@ -177,6 +163,7 @@ def load_subject(words: Sequence[str], folder: Path) -> Subject:
     for kind in [obs_type] if obs_type else [None, OBJECTS, BOTH]:
         try:
             with quiet():
+                # A copy, because `make_policy` sets the features; and one call, because some raise only there.
                 subject = _built(copy.deepcopy(config), *data, kind, folder / f"view {kind}")
                 subject.roll([subject.streams[0].until(subject.streams[0].start)])
             return subject
@@ -198,7 +185,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     from lerobot.policies import make_policy, make_pre_post_processors
 
     from lerobot_memobench.training.data import open_datasets, open_training
-    from lerobot_memobench.training.view import needs_view, view_options, write_view
+    from lerobot_memobench.training.trainer import needs_view, view_options, write_view
 
     raw = LeRobotDataset(repository, root=root)
     if not set(CLOCK) <= set(raw.meta.features):
@@ -212,11 +199,11 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
     if config.type == MEMORY_POLICY:
         training = open_training(whole, open_datasets(whole))
         policy, (before, after), dataset = training.policy, training.processors, training.samples()
-        policy.open_loop = True
+        policy.open_loop = True  # replayed hands do not follow its actions
     else:
         options = view_options(config, raw.meta.features, None, obs_type)
         if not options.prompts:
-            numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1
+            numbers = np.cumsum(read_frame_table(Path(raw.root)).acts) - 1  # the view lacks the other frames
         if needs_view(raw.meta.features, options):
             write_view(Path(raw.root), view, options)
             whole.dataset.root = str(view)
@@ -237,7 +224,7 @@ def _built(config: Any, repository: str, root: str | None, obs_type: str | None,
 
 
 def _draw_zero_weights(policy: Any) -> None:
-    """Draw the weights that are initialised to zero, behind which a memory would have no effect."""
+    # Behind weights that are initialised to zero, a memory would have no effect.
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for weights in policy.parameters():

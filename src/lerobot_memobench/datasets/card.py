@@ -43,23 +43,18 @@ SCRIPTED = (
     "Scripted experts act in a MuJoCo simulation; no data of people or robots was collected. Actions were recorded as "
     "applied (`executed_action`), so that replaying them from the seed gives the same states."
 )
-_STATISTICS = ("tasks", "episodes", "steps", "mean", "median", "p95", "max", "gib")
-FAMILIES: dict[str, dict[str, Any]] = {
-    "temporal": dict(zip(_STATISTICS, (10, 500, 198_099, 396.2, 400.5, 679.05, 779, 72.66), strict=True)),
-    "spatial": dict(zip(_STATISTICS, (10, 500, 357_865, 715.73, 727, 1101.1, 1513, 131.58), strict=True)),
-    "object": dict(zip(_STATISTICS, (5, 250, 121_276, 485.1, 492, 526, 556, 44.53), strict=True)),
-    "procedural": dict(zip(_STATISTICS, (5, 250, 250_204, 1000.82, 876, 1649.5, 2012, 91.79), strict=True)),
-    "total": dict(zip(_STATISTICS, (30, 1500, 927_444, 618.3, 489, 1110.1, 2012, 340.56), strict=True)),
+FAMILIES = {
+    "temporal": (10, 500, 198_099, 396.2, 400.5, 679.05, 779),
+    "spatial": (10, 500, 357_865, 715.73, 727, 1101.1, 1513),
+    "object": (5, 250, 121_276, 485.1, 492, 526, 556),
+    "procedural": (5, 250, 250_204, 1000.82, 876, 1649.5, 2012),
+    "total": (30, 1500, 927_444, 618.3, 489, 1110.1, 2012),
 }
-"""Rows of the paper's appendix, "Family level statistics"; ``gib``: size of its HDF5 files."""
-LENGTH_BUCKETS: dict[tuple[int, int | None], int] = {
-    **{(0, 200): 50, (200, 400): 199, (400, 600): 687, (600, 800): 108},
-    **{(800, 1000): 290, (1000, 1200): 110, (1200, 1500): 31, (1500, None): 25},
-}
-"""Steps [from, to) -> episodes of the paper's 1,500."""
+"""Rows of the paper's appendix, "Family level statistics": tasks, episodes, steps, mean, median, P95 and maximum."""
+LENGTH_BUCKETS = {0: 50, 200: 199, 400: 687, 600: 108, 800: 290, 1000: 110, 1200: 31, 1500: 25}
+"""Least steps -> episodes of the paper's 1,500."""
 
-Described = tuple[DemonstrationRecord, int]
-"""Record and length of an episode of this benchmark."""
+Described = tuple[DemonstrationRecord, int]  # record and length of an episode of this benchmark
 Notify = Callable[[str], None]
 
 
@@ -68,7 +63,7 @@ Notify = Callable[[str], None]
 
 def write_card(
     folder: Path,
-    episodes: Iterable[ListedEpisode],
+    described: Sequence[Described],
     failed: Sequence[StagedEpisode],
     features: dict[str, dict[str, Any]],
     *,
@@ -77,7 +72,6 @@ def write_card(
     left_out: Sequence[str] = (),
 ) -> None:
     """Write ``folder``/README.md: introduction, making, statistics, columns, limitations, licence."""
-    described = described_of(folder, episodes)
     requested = len(described) + len(failed)
     paragraphs = [
         (made_by or f"Written by `lerobot_memobench`. {SCRIPTED}") + " `manifest.json` holds a hash of every episode's "
@@ -110,16 +104,6 @@ def card_from_frames(folder: Path, episodes: Sequence[Described], repo_id: str |
     return _card(folder, episodes, [], read_info(folder)["features"], [EDITED], location)
 
 
-def hub_card(folder: Path, repo_id: str) -> str:
-    """Return the card of a dataset for ``repo_id`` on the hub; its examples load the dataset from there."""
-    with undamaged(folder):
-        episodes = list_episodes(folder)
-        card = own_card(folder, len(episodes))
-    if card is not None:
-        return re.sub(r'LeRobotDataset\("[^"\n]*", root="[^"\n]*"\)', f'LeRobotDataset("{repo_id}")', card)
-    return card_from_frames(folder, described_of(folder, episodes), repo_id)
-
-
 def described_of(folder: Path, episodes: Iterable[ListedEpisode]) -> list[Described]:
     """Return records and lengths of a dataset's episodes, without episodes of other programs."""
     described = [(episode.record, episode.length) for episode in episodes if episode.record is not None]
@@ -136,13 +120,18 @@ def _card(
     paragraphs: Sequence[str],
     location: str,
 ) -> str:
-    """Return the card; ``paragraphs`` are on the making, ``location`` the arguments of ``LeRobotDataset``."""
+    # ``paragraphs`` are on the making, ``location`` the arguments of ``LeRobotDataset``.
     records = [record for record, _ in episodes]
     fields = ("task_name", "memory_type", "operations", "exec_start_index")
     table = pd.DataFrame([record.model_dump(include={*fields}) | {"frames": length} for record, length in episodes])
     types = [name for name in FAMILIES if name in {*table.memory_type}]
     types += sorted({*table.memory_type} - {*FAMILIES})
-    of_authors = parts_of_authors(records)
+    # MEMOBench's authors made converted demonstrations (`generate` knows the seed) and scans; they decide the licence.
+    parts = {
+        "The demonstrations": any(record.seed < 0 for record in records),
+        "The scanned objects": any(map(_shows_scans, records)),
+    }
+    of_authors = [part for part, shown in parts.items() if shown]
     data = DatasetCardData(
         license="cc-by-nc-4.0" if of_authors else "other",
         task_categories=["robotics"],
@@ -159,7 +148,7 @@ def _card(
     card = DatasetCard.from_template(
         data,
         str(Path(__file__).with_name("card.md.jinja")),
-        total=_statistics(table),
+        total={"episodes": len(table), "tasks": table.task_name.nunique()},
         types=types,
         stand_ins=sorted({name for record in records for name in record.stand_ins}),
         location=location,
@@ -182,57 +171,36 @@ def _type(feature: dict[str, Any]) -> str:
     return feature["dtype"] if shape == (1,) else f"{feature['dtype']} {'×'.join(map(str, shape))}"
 
 
-def parts_of_authors(records: Sequence[DemonstrationRecord]) -> list[str]:
-    """Return the parts of a dataset that are of MEMOBench's authors, which decide its licence."""
-    parts = {
-        "The demonstrations": any(record.seed < 0 for record in records),  # converted: `generate` knows the seed
-        "The scanned objects": any(map(_shows_scans, records)),
-    }
-    return [part for part, shown in parts.items() if shown]
-
-
 def _shows_scans(record: DemonstrationRecord) -> bool:
-    """Return whether an episode's scene has a scan: each object of a spatial task is one or a stand-in."""
+    # Each object of a spatial task is a scan or a stand-in.
     if record.memory_type != "spatial" or suite_of(record.task_name) is None:
         return False
     return not {*get_task(record.task_name).objects.values()} <= {*record.stand_ins}
 
 
-def _statistics(table: pd.DataFrame) -> dict[str, Any]:
-    return {
-        "tasks": table.task_name.nunique(),
-        "episodes": len(table),
-        "steps": table.frames.sum(),
-        "mean": table.frames.mean(),
-        "median": table.frames.median(),
-        "p95": np.percentile(table.frames, 95),
-        "max": table.frames.max(),
-    }
-
-
 def _lengths_table(table: pd.DataFrame, types: Sequence[str]) -> str:
+    def row(name: str, source: str, values: Sequence[float]) -> list[str]:
+        # Mean, median and P95 have decimals.
+        return [name, source, *(f"{value:,.2f}" if 3 <= k <= 5 else f"{value:,}" for k, value in enumerate(values))]
+
     rows = []
     for name in [*types, "total"]:
         part = table if name == "total" else table[table.memory_type == name]
-        rows.append([name, "here", *_lengths(_statistics(part))])
+        steps = part.frames
+        counts = (part.task_name.nunique(), len(part), steps.sum())
+        rows.append(row(name, "here", (*counts, steps.mean(), steps.median(), steps.quantile(0.95), steps.max())))
         if name in FAMILIES:
-            rows.append(["", "paper", *_lengths(FAMILIES[name])])
+            rows.append(row("", "paper", FAMILIES[name]))
     return markdown(["memory type", "", "tasks", "episodes", "steps", "mean", "median", "P95", "max"], rows)
 
 
-def _lengths(row: Mapping[str, Any]) -> list[str]:
-    whole, parts = ("tasks", "episodes", "steps"), ("mean", "median", "p95")
-    return [*(f"{row[key]:,}" for key in whole), *(f"{row[key]:,.2f}" for key in parts), f"{row['max']:,}"]
-
-
 def _buckets_table(lengths: pd.Series[int]) -> str:
-    published = sum(LENGTH_BUCKETS.values())
-    rows = []
-    for (low, high), theirs in LENGTH_BUCKETS.items():
-        ours = int(((lengths >= low) & (lengths < (high or np.inf))).sum())
-        span = f"{low:,}+" if high is None else f"{low:,}–{high - 1:,}"
-        shares = [f"{100 * ours / len(lengths):.2f} %", f"{100 * theirs / published:.2f} %"]
-        rows.append([span, f"{ours:,}", shares[0], f"{theirs:,}", shares[1]])
+    edges, rows = [*LENGTH_BUCKETS, np.inf], []
+    ours, theirs = np.histogram(lengths, edges)[0], np.array([*LENGTH_BUCKETS.values()])
+    for low, high, here, published in zip(edges[:-1], edges[1:], ours, theirs, strict=True):
+        span = f"{low:,}+" if high == np.inf else f"{low:,}–{high - 1:,}"
+        shares = (100 * here / ours.sum(), 100 * published / theirs.sum())
+        rows.append([span, f"{here:,}", f"{shares[0]:.2f} %", f"{published:,}", f"{shares[1]:.2f} %"])
     return markdown(["length", "episodes here", "share", "episodes in the paper", "share"], rows)
 
 
@@ -282,7 +250,7 @@ def describe(folder: Path, out: Path, notify: Notify = lambda _: None) -> list[P
         if not (folder / CARD_FILE).exists():
             try:
                 write_file(folder / CARD_FILE, text)
-            except OSError as error:
+            except OSError as error:  # a mounted dataset may be read-only
                 notify(f"its card could not be written to {folder} ({error.strerror})")
     tables = MADE_BY + text.partition(MADE_BY)[2].partition("## Columns")[0].rstrip() + "\n"
     with explaining_disk_errors(out):
@@ -299,7 +267,7 @@ def _manifest_of(episodes: Sequence[Described]) -> dict[str, Any]:
 
 
 def _short_manifest(manifest: Mapping[str, Any]) -> str:
-    """Return a manifest as JSON with one line per task: seed to the episode's hash, or to the reason of its failure."""
+    # One line per task: seed to the episode's hash, or to the reason of its failure.
     tasks: dict[str, dict[str, str]] = {}
     for row in manifest["episodes"]:
         tasks.setdefault(row["task_name"], {})[str(row["seed"])] = row["failure"] or row["digest"]
@@ -329,11 +297,8 @@ def push(
     The repository then holds this dataset and no file of an earlier one, which remains in its history. The same call
     continues an interrupted upload: huggingface_hub skips files whose hash the hub has already.
 
-    Args:
-        repo_id: ``user/name`` on the hub; created if necessary.
-        token: token with write access; by default the one of ``hf auth login`` or HF_TOKEN.
-        private: whether a created repository is private; None uses the account's setting.
-        notify: called with a message about files that are not uploaded.
+    ``token`` is by default the one of ``hf auth login`` or HF_TOKEN; ``private`` is that of a created repository, by
+    default the account's setting. ``notify`` is called with a message about files that are not uploaded.
 
     Raises:
         MemobenchError: no dataset, no token, a token without write access, or a hub that cannot be reached.
@@ -350,7 +315,13 @@ def push(
         raise MemobenchError(
             f"there is no token to write to {repo_id}: run `hf auth login`, set HF_TOKEN, or pass a token"
         )
-    card = hub_card(folder, repo_id)
+    with undamaged(folder):
+        episodes = list_episodes(folder)
+        card = own_card(folder, len(episodes))
+    if card is None:
+        card = card_from_frames(folder, described_of(folder, episodes), repo_id)
+    else:  # its examples load the dataset from this disk
+        card = re.sub(r'LeRobotDataset\("[^"\n]*", root="[^"\n]*"\)', f'LeRobotDataset("{repo_id}")', card)
     if (folder / "feature_cache").is_dir():
         notify(f"the feature caches in {folder} are not uploaded; training makes them again elsewhere")
     api = HfApi(token=token)
@@ -384,6 +355,7 @@ def _hub_errors(repo_id: str) -> Iterator[None]:
     except (HFValidationError, HfHubHTTPError, httpx.TransportError, OSError) as error:
         line = " ".join(str(error).split())
         status = getattr(getattr(error, "response", None), "status_code", None)
+        reason = f"the hub could not be reached ({type(error).__name__}: {line[:200]}); repeat the command to continue"
         if isinstance(error, HFValidationError):
             reason = f"the hub does not allow the repository name {repo_id!r}: {line}"
         elif status in (401, 403):
@@ -393,8 +365,4 @@ def _hub_errors(repo_id: str) -> Iterator[None]:
             )
         elif isinstance(error, HfHubHTTPError):
             reason = f"the hub answered {line[:300]}; repeat the command to continue"
-        else:
-            reason = (
-                f"the hub could not be reached ({type(error).__name__}: {line[:200]}); repeat the command to continue"
-            )
         raise MemobenchError(reason) from None

@@ -25,16 +25,14 @@ from typing import Any
 from pydantic import BaseModel
 
 from lerobot_memobench.constants import CAMERAS, IMAGE_SIZE
-from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
 from lerobot_memobench.datasets.generate import check_room, run_size
-from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, Unusable, demo_number, first_line, unusable_on_error
+from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, demo_number, first_line
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, restore, task_of, unlike_the_catalogue
 from lerobot_memobench.datasets.stage import (
     EpisodeStage,
     StagedJob,
-    check_destination,
     episodes_folder,
     finished_manifest,
     stage_failure,
@@ -50,15 +48,12 @@ from lerobot_memobench.io import (
     in_words,
     write_file,
 )
-from lerobot_memobench.jobs.processes import Advance, ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import Advance, ProgressCallback, run_jobs
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT
 from lerobot_memobench.sim.files import check_assets
-from lerobot_memobench.untrusted import Count, check_fetched, read_json
+from lerobot_memobench.untrusted import Count, check_fetched, read_json, refusing
 
 SUFFIXES = (".hdf5", ".h5")
-MACOS_FOLDER = "__MACOSX"
-"""Folder that macOS adds to archives."""
 UNPACKED_FRAME = len(CAMERAS) * 3 * IMAGE_SIZE**2
 """Bytes of a frame's images in the published files, which are not compressed."""
 
@@ -96,7 +91,6 @@ def convert(
     The first images of each file, compared with those drawn of their state, show how all of them are stored.
 
     Args:
-        source: the file, folder or archive.
         out: absent, empty, or an unfinished conversion of the same files.
         convention: of the images in the dataset (`sim.convention`).
         progress: called after each episode; its ``task_name`` is the file's name, its ``seed`` the group's number,
@@ -113,13 +107,10 @@ def convert(
     staging = out / STAGING
     files, problems = find_files(source, staging.absolute() / "unpacked")
     request = {"files": [file.identity for file in files], "convention": convention}
-    manifest = finished_manifest(out, request, "left_out")
+    manifest = finished_manifest(out, request)
     if manifest is not None:
-        left_out, noted = (
-            tuple(map(ConversionNote.model_validate, manifest.get(key, []))) for key in ("left_out", "notes")
-        )
-        return ConversionSummary(out, len(manifest["episodes"]), left_out, noted)
-    check_destination(out)
+        earlier = (map(ConversionNote.model_validate, manifest.get(key, [])) for key in ("left_out", "notes"))
+        return ConversionSummary(out, len(manifest["episodes"]), *map(tuple, earlier))
     with (
         explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
         episodes_folder(out, request) as folder,
@@ -159,26 +150,19 @@ def convert(
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file to convert.
+    """A file to convert; ``identity`` distinguishes it from another file of the same name."""
 
-    Attributes:
-        name: path within the source.
-        size: bytes, unpacked.
-        identity: distinguishes it from another file of the same name.
-        member: its entry in an archive, from which it is unpacked to ``path``; None for a file of a folder.
-    """
-
-    name: str
-    size: int
+    name: str  # path within the source
+    size: int  # bytes, unpacked
     path: Path
     identity: list[Any]
-    member: zipfile.ZipInfo | None = None
+    member: zipfile.ZipInfo | None = None  # entry of an archive, from which it is unpacked to ``path``
 
 
 def find_files(source: Path, unpacked: Path) -> tuple[list[SourceFile], list[ConversionNote]]:
-    """Return the HDF5 files of a path, sorted by name, and the files of an archive whose names are refused.
+    """Return the HDF5 files of a path, sorted by name, and those of an archive whose names are refused.
 
-    An archive's files will be unpacked below ``unpacked``.
+    The others of an archive will be unpacked below ``unpacked``.
     """
     if not source.exists():
         raise MemobenchError(f"{source} does not exist; name an HDF5 file, a folder of them, or a zip archive")
@@ -213,12 +197,13 @@ def _entries(archive: Path) -> list[zipfile.ZipInfo]:
         raise MemobenchError(
             f"{archive} is no zip archive, or was not downloaded completely ({first_line(error)}); download it again"
         ) from None
-    chosen = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith(MACOS_FOLDER)]
+    # macOS adds a folder with a fork of each file to archives.
+    chosen = [e for e in entries if e.filename.lower().endswith(SUFFIXES) and not e.filename.startswith("__MACOSX")]
     return sorted(chosen, key=lambda entry: entry.filename)
 
 
 def unpack_member(archive: Path, file: SourceFile) -> None:
-    """Write a file of an archive to its path, or raise `Unusable`."""
+    """Write a file of an archive to its path, or raise."""
     assert file.member is not None
     file.path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -226,36 +211,40 @@ def unpack_member(archive: Path, file: SourceFile) -> None:
             with zipfile.ZipFile(archive) as opened, opened.open(file.member) as packed, draft.open("wb") as unpacked:
                 shutil.copyfileobj(packed, unpacked, 2**22)
             if draft.stat().st_size != file.size:
-                raise Unusable(f"it is {draft.stat().st_size} bytes long, expected {file.size}")
+                raise MemobenchError(f"it is {draft.stat().st_size} bytes long, expected {file.size}")
     except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
-        raise Unusable(f"it cannot be unpacked ({first_line(error)}); download the archive again") from None
+        raise MemobenchError(f"it cannot be unpacked ({first_line(error)}); download the archive again") from None
 
 
 def _report_size(files: Sequence[SourceFile], folder: Path, out: Path, notify: Callable[[str], None]) -> None:
-    total, largest = sum(file.size for file in files), max((file.size for file in files), default=0)
+    total, unpacked = sum(file.size for file in files), max((file.size for file in files if file.member), default=0)
     size = run_size(total // UNPACKED_FRAME, IMAGE_SIZE)
     staged_size = sum(path.stat().st_size for path in files_below(folder))
-    work, extra = f"{count_of(len(files), 'file')} of {in_words(total)}", 0
-    if any(file.member is not None for file in files):
-        work, extra = f"{work}, unpacked one by one (up to {in_words(largest)})", largest
-    check_room(out, size, min(staged_size, size), notify, work, extra=extra)
+    one_by_one = f", unpacked one by one (up to {in_words(unpacked)})" if unpacked else ""
+    work = f"{count_of(len(files), 'file')} of {in_words(total)}{one_by_one}"
+    check_room(out, size, min(staged_size, size), notify, work, extra=unpacked)
 
 
 # --- inspection of a file ---
 
 
-class Findings(BaseModel):
-    """Problems and notes of a file, how its images are stored, and its sound groups with height and width of images."""
+def _unusable(why: str) -> MemobenchError:
+    return MemobenchError(f"its content cannot be used ({why})")
 
-    demonstrations: dict[str, list[Count]] = {}
+
+class Findings(BaseModel):
+    """Groups of a file, size and orientation of their images, problems of the file as a whole, and notes."""
+
+    groups: list[str]
+    image_size: list[Count] = []  # height and width, of the first sound group
     problems: list[ConversionNote] = []
     notes: list[ConversionNote] = []
     orientation: str | None = None
 
 
 def inspect(file: SourceFile) -> Findings:
-    """Return the findings of a file."""
-    findings = Findings()
+    """Return the findings of a file; the conversion of a group reports why it cannot be used."""
+    findings = Findings(groups=[])
 
     def leave_out(group: str, reason: object) -> None:
         findings.problems.append(ConversionNote(file=file.name, group=group, reason=str(reason)))
@@ -265,31 +254,27 @@ def inspect(file: SourceFile) -> Findings:
         findings.notes += [entry] * (entry not in findings.notes)
 
     try:
-        with PublishedFile(file.path) as opened, unusable_on_error():
-            announced, groups = opened.announced(), opened.groups()
-            if announced not in (None, len(groups)):
-                leave_out("data", f"its num_demos is {announced}, but there are {len(groups)} demonstrations")
-            if not groups:
+        with PublishedFile(file.path) as opened, refusing(_unusable):
+            announced, findings.groups = opened.announced(), opened.groups()
+            if announced not in (None, len(findings.groups)):
+                leave_out("data", f"its num_demos is {announced}, but there are {len(findings.groups)} demonstrations")
+            if not findings.groups:
                 leave_out("data", "it has no demonstrations")
-            for group in groups:
-                try:
+            for group in findings.groups:
+                with suppress(MemobenchError):
                     demo = opened.read(group)
                     findings.orientation = findings.orientation or orientation_of(opened, demo)
-                except Unusable as error:
-                    leave_out(f"data/{group}", error)
-                    continue
-                findings.demonstrations[group] = [*demo.image_size]
-                with suppress(MemobenchError):  # its conversion reports it
+                    findings.image_size = findings.image_size or [*demo.image_size]
                     task = task_of(opened, demo).variant(0)
                     if differences := unlike_the_catalogue(task):
                         note(differences)
                     if opened.lacks_its_text:
                         note(f"bddl_file_content is no text: the task is the catalogue's {task.name}")
-    except Unusable as error:
+    except MemobenchError as error:
         leave_out("", error)
-    if findings.demonstrations and findings.orientation is None:
+    if findings.image_size and findings.orientation is None:
         note("whether its images are upright is not clear, as its state shows none like them: they are not turned")
-    elif findings.demonstrations and findings.orientation != UPRIGHT:
+    elif findings.image_size and findings.orientation != UPRIGHT:
         note(f"its images are {findings.orientation}: they are turned")
     return findings
 
@@ -299,7 +284,7 @@ def inspect(file: SourceFile) -> Findings:
 
 @dataclass
 class _Conversion:
-    """Stage the episodes of one file after another; ``resumed`` counts those that an earlier run had made."""
+    """Stage the episodes of one file after another."""
 
     source: Path
     staging: Path
@@ -312,7 +297,8 @@ class _Conversion:
     jobs: list[ConversionJob] = field(default_factory=list)
     problems: list[ConversionNote] = field(default_factory=list)
     notes: list[ConversionNote] = field(default_factory=list)
-    resumed: int = 0
+    image_size: tuple[int, ...] = ()  # of the first demonstration, which all must have
+    resumed: int = 0  # episodes of an earlier run
 
     def add(self, number: int, file: SourceFile) -> None:
         """Inspect a file and stage its demonstrations; ``number`` counts from 1."""
@@ -345,20 +331,19 @@ class _Conversion:
             )
         try:
             unpack_member(self.source, file)
-        except Unusable as error:
+        except MemobenchError as error:
             if findings is not None:  # an earlier run found its demonstrations
                 raise MemobenchError(f"{self.source}, {file.name}: {error}") from None
-            return Findings(problems=[ConversionNote(file=file.name, group="", reason=str(error))])
+            return Findings(groups=[], problems=[ConversionNote(file=file.name, group="", reason=str(error))])
         return findings
 
     def _jobs_of(self, file: SourceFile, findings: Findings) -> list[ConversionJob]:
-        """Return the jobs of a file; they refuse images of another size than the first demonstration's."""
-        jobs: list[ConversionJob] = []
-        turn = ORIENTATIONS[findings.orientation or UPRIGHT]
-        for number, (group, (height, width)) in enumerate(findings.demonstrations.items(), len(self.jobs)):
-            size = next((job.image_size for job in (*self.jobs[:1], *jobs[:1])), (height, width))
-            jobs.append(ConversionJob(file.path, group, self.folder / f"{number:06d}", size, turn, self.convention))
-        return jobs
+        self.image_size = self.image_size or tuple(findings.image_size)
+        shared = (self.image_size, ORIENTATIONS[findings.orientation or UPRIGHT], self.convention)
+        return [
+            ConversionJob(file.path, group, self.folder / f"{number:06d}", *shared)
+            for number, group in enumerate(findings.groups, len(self.jobs))
+        ]
 
     def _counting(self, number: int, jobs: int) -> ProgressCallback:
         """Return the callback of a file's jobs; later files are assumed to have as many episodes per byte."""
@@ -381,7 +366,7 @@ class ConversionJob(StagedJob):
     file: Path
     group: str
     folder: Path
-    image_size: tuple[int, int]
+    image_size: tuple[int, ...]
     turn: tuple[int, int]
     convention: str
 
@@ -399,7 +384,15 @@ class ConversionJob(StagedJob):
         """Stage the episode, or the reason why it cannot be used."""
         try:
             with PublishedFile(self.file) as file:
-                demo = self._restored(file)
+                with refusing(_unusable):
+                    published = file.read(self.group)
+                    if self.image_size not in ((), published.image_size):
+                        sizes = ["×".join(map(str, size)) for size in (published.image_size, self.image_size)]
+                        raise MemobenchError(
+                            f"its images are {sizes[0]} pixels, those of the first demonstration {sizes[1]}"
+                        )
+                    demo = restore(task_of(file, published), published)
+                    DemonstrationRecord.of(demo)  # a bad value ends this episode, not the assembly of all
                 with EpisodeStage(self.folder, self.convention) as stage:
                     for images in file.images(self.group, *self.turn):
                         stage.add_images(images)
@@ -410,15 +403,3 @@ class ConversionJob(StagedJob):
         except Exception as error:
             error.add_note(f"while converting {self.file}, {self.group}")
             raise
-
-    def _restored(self, file: PublishedFile) -> Demonstration:
-        with unusable_on_error():
-            demo = file.read(self.group)
-            if demo.image_size != self.image_size:
-                raise Unusable(
-                    f"its images are {demo.image_size[0]}×{demo.image_size[1]} pixels, those of the first "
-                    f"demonstration {self.image_size[0]}×{self.image_size[1]}"
-                )
-            restored = restore(task_of(file, demo), demo)
-            DemonstrationRecord.of(restored)  # a bad value ends this episode, not the assembly of all
-            return restored

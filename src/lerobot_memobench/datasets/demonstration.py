@@ -32,8 +32,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.memory_text import memory_text, subtask_texts
 from lerobot_memobench.tasks.task import LEVELS, OPERATIONS, STRICT, Task
 
-MAX_CHECKPOINTS = 6
-"""Width of ``checkpoint.completed``: no task of the benchmark has more checkpoints."""
+MAX_CHECKPOINTS = 6  # width of `checkpoint.completed`: no task of the benchmark has more checkpoints
 MIN_FRAMES_BETWEEN_ROWS = 5
 """LeRobot's ``emitted_at`` searches 0.1 s to either side and raises if it finds two rows of a style, so rows of one
 style must be more than 0.2 s apart: at 20 frames/s, at least 5 frames."""
@@ -50,8 +49,7 @@ HASHED = {
     "memory": MEMORY_COLUMN,
 }
 """Name of a label in an episode's hash -> its column."""
-Labels = dict[str, Any]
-"""Column -> T values: an array, or a list of texts."""
+Labels = dict[str, Any]  # column -> T values: an array, or a list of texts
 LanguageRow = dict[str, Any]
 
 
@@ -102,8 +100,7 @@ class Demonstration:
     held: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        problem = next(self._problems(), None)
-        if problem is not None:
+        for problem in self._problems():
             raise MemobenchError(f"demonstration of {self.task.name} with seed {self.seed}: {problem}")
 
     def _problems(self) -> Iterator[str]:
@@ -131,10 +128,7 @@ class Demonstration:
         if not 0 <= self.exec_start < length:
             yield f"execution starts at frame {self.exec_start} of {length}; expected one of the episode's frames"
         if self.satisfied[: self.exec_start].any():
-            yield (
-                f"a checkpoint is satisfied in the demonstration prompt, before frame {self.exec_start}; checkpoints "
-                "count from the start of execution only"
-            )
+            yield f"a checkpoint is satisfied in the prompt, before execution starts at frame {self.exec_start}"
 
     def __len__(self) -> int:
         """Return T, demonstration prompt included."""
@@ -214,10 +208,9 @@ def persistent_rows(columns: Labels) -> list[LanguageRow]:
     active from its timestamp until the next of its style (``lerobot.datasets.language``). The styles are those of its
     annotation pipeline: ``subtask`` (the next step, as an instruction) and ``memory`` (the completed steps, in the past
     tense; none before the first completion).
-
-    A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins, so
-    no row names a completion too early. The per-frame string columns contain every change.
     """
+    # A text that is replaced within 0.2 s gets no row: the text before it stays active until the one after it begins,
+    # so no row names a completion too early.
     rows = [_row("subtask", text, frame) for frame, text in _changes(columns[INSTRUCTION_COLUMN])]
     rows += [_row("memory", text, frame) for frame, text in _changes(columns[MEMORY_COLUMN]) if text]
     return sorted(rows, key=lambda row: (row["timestamp"], row["style"], row["role"]))

@@ -54,8 +54,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-Filter = list[tuple[str, str, int]]
-"""Column, comparison and number of the rows to read."""
+Filter = list[tuple[str, str, int]]  # column, comparison and number of the rows to read
 
 
 def undamaged(folder: Path) -> AbstractContextManager[None]:
@@ -143,9 +142,6 @@ def texts(column: pa.ChunkedArray) -> list[str]:
     return [(value[0] if isinstance(value, list) else value) or "" for value in column.to_pylist()]
 
 
-DETERMINED = {"memory_type", "family", "operations", "success", "key_frames", "scene_hash", "fixture_poses", "digest"}
-
-
 class DemonstrationRecord(BaseModel):
     """The facts of an episode as a whole: its task, seed, placement and hashes.
 
@@ -210,14 +206,6 @@ class DemonstrationRecord(BaseModel):
             stand_ins=list(demo.stand_ins),
         )
 
-    def determined(self) -> dict[str, Any]:
-        """Return the fields that are determined by task, seed and actions."""
-        return self.model_dump(include=DETERMINED)
-
-    def in_frames(self) -> str:
-        """Return the text of the first frame's column."""
-        return self.model_dump_json(exclude_none=True)
-
     def in_meta(self) -> dict[str, Any]:
         """Return the columns of ``meta/episodes``."""
         return self.model_dump(exclude={"versions"}) | {
@@ -253,22 +241,19 @@ def from_meta(row: Mapping[str, Any]) -> DemonstrationRecord | None:
         return None
 
 
-class EpisodeRequest(TypedDict):
-    """A requested episode."""
+class FailedEpisode(TypedDict):
+    """A requested episode that could not be made, and the reason."""
 
     task_name: str
     seed: Whole
-
-
-class FailedEpisode(EpisodeRequest):
-    """An episode that could not be made, and the reason."""
-
     failure: str
 
 
-class MadeEpisode(EpisodeRequest):
-    """An episode of the dataset."""
+class MadeEpisode(TypedDict):
+    """A requested episode of the dataset."""
 
+    task_name: str
+    seed: Whole
     failure: None
     episode_index: Count
     frames: Count
@@ -464,10 +449,8 @@ def _read_columns(root: Path, episode_index: int) -> Columns:
 
 
 EPISODES_FILE = EPISODES + "/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-PLACES = ("index", "timestamp", "length", "tasks")
-"""Ends of the names of columns that place episodes and frames."""
-TOLERANCE = 1e-3
-"""Largest difference of times, s or frames."""
+PLACES = ("index", "timestamp", "length", "tasks")  # ends of the names of columns that place episodes and frames
+TOLERANCE = 1e-3  # largest difference of times, s or frames
 
 
 def check_whole(folder: Path) -> None:
@@ -566,23 +549,15 @@ def _check_video(path: Path, frames: int) -> None:
         raise MemobenchError(f"{path} has {stated} frames, meta/episodes names {frames}; {ADVICE}")
 
 
-def _read_all(folder: Path) -> None:
-    tables = [path for part in ("data", "meta") for path in files_below(folder / part, ".parquet")]
-    for path in [folder / STATS_FILE, folder / TASKS_FILE, *tables, *files_below(folder / "videos", ".mp4")]:
-        if not path.is_file():
-            raise MemobenchError(f"{path} is missing; {ADVICE}")
-        if path.suffix == ".json":
-            read_json(path, dict[str, dict[str, Any]], ADVICE, nan=True)
-        else:
-            read_to_end(path)
-
-
 def read_to_end(path: Path) -> None:
-    """Read all values of a table, or decode all frames of a video."""
+    """Read a JSON file, all values of a table, or all frames of a video."""
     import av
     import pyarrow.parquet as pq
 
     with undamaged(path):
+        if path.suffix == ".json":
+            read_json(path, dict[str, Any], ADVICE, nan=True)
+            return
         if path.suffix == ".parquet":
             pq.read_table(path)
             return
@@ -610,8 +585,12 @@ def naming_damage(folder: Path | None) -> Iterator[None]:
         reading = any(name.startswith(("lerobot.datasets.", "datasets.", "torch.utils.data.")) for name in names)
         if folder is None or not reading or not (folder / INFO_FILE).is_file():
             raise
+        files = [path for part in ("data", "meta", "videos") for path in files_below(folder / part, ".parquet", ".mp4")]
         try:
-            _read_all(folder)
+            for path in (folder / STATS_FILE, folder / TASKS_FILE, *files):
+                if not path.is_file():
+                    raise MemobenchError(f"{path} is missing; {ADVICE}")
+                read_to_end(path)
             check_whole(folder)
         except MemobenchError as damage:
             raise damage from error

@@ -79,11 +79,8 @@ def read_frame_table(root: Path) -> FrameTable:
 
 
 def _resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
-    """Assign to each frame without a text that of the next annotated frame of its episode, or else of the last one.
-
-    ``rows`` (N,) are text numbers, -1 for none, which remains in episodes without any text only (paper, framewise
-    alignment).
-    """
+    # A frame without a text (-1) has that of the next annotated frame of its episode, or else of the last one (paper,
+    # framewise alignment).
     resolved = rows.copy()
     for start, end in itertools.pairwise(episodes):
         annotated = np.flatnonzero(rows[start:end] >= 0)
@@ -106,12 +103,10 @@ class TextEncoder(Protocol):
 
 # --- lookup ---
 
-Columns = Mapping[str, Tensor]
-"""Column -> its numbers (N, ...) of every frame, in the order of the global index."""
+Columns = Mapping[str, Tensor]  # column -> its numbers (N, ...) of every frame, in the order of the global index
 Remember = Callable[[int, Sequence[int]], Tensor]
 """From (episode, slots) to remembered features (n, P, D); slot k is the episode's frame k * stride."""
-Encoded = Callable[[Sequence[int]], Tensor]
-"""From global indices (n,) to features (n, ...) of those frames."""
+Encoded = Callable[[Sequence[int]], Tensor]  # from global indices (n,) to features (n, ...) of those frames
 
 
 class FrameLookup:
@@ -127,11 +122,8 @@ class FrameLookup:
         encoded: name in a training sample -> features of the present frame.
 
     Attributes:
-        episodes, phase, acts: see `FrameTable`.
         runs: first frames of the parts of episodes between holds, and of the holds, and N.
-        texts: distinct subgoals.
-        text_embeddings: (texts, d_t).
-        memories: distinct oracle memory texts.
+        texts, memories: distinct subgoals, whose embeddings are ``text_embeddings``, and distinct oracle memory texts.
     """
 
     def __init__(
@@ -188,9 +180,8 @@ class FrameLookup:
         return int(self.runs[following - 1]), int(self.runs[following])
 
     def tokens(self, episode: int, slots: Sequence[int]) -> Tensor:
-        """Return the remembered features (n, P, D) of an episode's slots; slot k is its frame k * stride."""
-        if self._remember is None:
-            raise LookupError("this lookup has no remembered features")
+        """Return the remembered features (n, P, D) of an episode's slots (`Remember`)."""
+        assert self._remember is not None
         return self._remember(episode, slots)
 
     def changes(self, episode: int) -> np.ndarray:

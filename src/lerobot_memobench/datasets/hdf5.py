@@ -17,19 +17,19 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, NotRequired, TypedDict
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import check_regular
-from lerobot_memobench.untrusted import Malformed, check_fetched, parsed, refusing
+from lerobot_memobench.untrusted import Malformed, check_fetched, checked, parsed, refusing
 
 if TYPE_CHECKING:
     import h5py
@@ -39,21 +39,10 @@ IMAGE_NAMES = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_im
 LIBERO_NAMES = {"image": "agentview_rgb", "wrist_image": "eye_in_hand_rgb"}
 """Camera of this package -> array of LIBERO's own files, whose names are also accepted."""
 FILE_OBJECT = re.compile(r"<(_io\.\w+|open file) .*>")
-NO_SEED = -1
-"""Seed of a demonstration, which the layout does not hold."""
+NO_SEED = -1  # the layout does not hold seeds
 SUFFIX = "_demo.hdf5"
-FRAMES_PER_READ = 32
-LARGEST = 1e10
-"""MuJoCo treats a state with a larger number as unstable and replaces it by the initial state."""
-
-
-class Unusable(MemobenchError):
-    """A file or group that is not in the layout. The message is the reason; callers add file and group."""
-
-
-def unusable_on_error() -> AbstractContextManager[None]:
-    """Turn every error of a block into `Unusable`, so that a bad file or group does not end the conversion."""
-    return refusing(lambda why: Unusable(f"its content cannot be used ({why})"))
+FRAMES_PER_READ = 32  # in memory at a time
+LARGEST = 1e10  # MuJoCo treats a state with a larger number as unstable and replaces it by the initial state
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +58,7 @@ class PublishedDemo:
 
 
 class PublishedFile:
-    """A file in the published layout; a context.
-
-    `Unusable` names the first difference to the layout: on opening it concerns the file, by `read` a group.
-    """
+    """A file in the published layout; a context. Errors name the first difference to the layout, without the file."""
 
     def __init__(self, path: Path) -> None:
         import h5py
@@ -81,24 +67,25 @@ class PublishedFile:
         try:
             check_regular(path)
             self._file: h5py.File = h5py.File(path, "r")
-        except MemobenchError as error:
-            raise Unusable(str(error)) from None
         except OSError as error:
-            raise Unusable(_open_error(path, error)) from None
+            raise MemobenchError(_open_error(path, error)) from None
         try:
-            _check_own(self._file)
+            # HDF5 would read any file of this machine that external links and arrays name.
+            if name := self._file.visititems_links(_outside) or self._file.visititems(_outside):
+                raise MemobenchError(
+                    f"{name!r} is read from another file (a link, external storage or a virtual array); copy it in"
+                )
             data = self._file.get("data")
             if not isinstance(data, h5py.Group):
-                raise Unusable(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
+                raise MemobenchError(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
             self._data: h5py.Group = data
-            _check_layout(data)
             self.bddl_name = _text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = _text_attribute(data, "bddl_file_content", required=True)
         except Exception as error:
             self._file.close()
-            if isinstance(error, Unusable):
+            if isinstance(error, MemobenchError):
                 raise
-            raise Unusable(f"it is damaged ({first_line(error)})") from None
+            raise MemobenchError(f"it is damaged ({first_line(error)})") from None
 
     def __enter__(self) -> PublishedFile:
         return self
@@ -112,7 +99,7 @@ class PublishedFile:
         return _is_file_object(self.bddl_text)
 
     def attribute(self, name: str) -> str | None:
-        """Return a text attribute of ``data``, or None."""
+        """Return a text attribute of the group ``data``, or None."""
         return _text_attribute(self._data, name)
 
     def groups(self) -> list[str]:
@@ -124,52 +111,42 @@ class PublishedFile:
         value = self._data.attrs.get("num_demos")
         return int(value) if isinstance(value, int | np.integer) else None
 
-    def read(self, group: str) -> PublishedDemo:
-        """Read and check one demonstration, except its pixels."""
-        with refusing(lambda why: Unusable(f"it cannot be read ({why})")):
-            return self._read(group)
-
-    def _read(self, name: str) -> PublishedDemo:
+    @refusing(lambda why: MemobenchError(f"it cannot be read ({why})"))
+    def read(self, name: str) -> PublishedDemo:
+        """Read and check the group of one demonstration, except its pixels."""
         import h5py
 
         group = self._data.get(name)
-        if group is None:
-            raise Unusable(f"the group {name!r} is missing")
         if demo_number(name) is None or not isinstance(group, h5py.Group):
-            raise Unusable("it is no group demo_<number>")
+            raise MemobenchError("it is no group demo_<number>")
         states = _array(group, "states", (None, None), np.float64)
         actions = _array(group, "actions", (None, ACTION_DIM), np.float32, np.float64)
-        if not isinstance(group.get("obs"), h5py.Group):
-            raise Unusable("the group 'obs' is missing")
         images = {
             image: _array(group, f"obs/{image}", (None, None, None, 3), np.uint8)
-            for image in _image_names(group["obs"]).values()
+            for image in _image_names(group.get("obs", ())).values()
         }
         _check_length(group, {"states": states, "actions": actions, **images})
         sizes = {image.shape[1:3] for image in images.values()}
         if len(sizes) > 1:
-            raise Unusable(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
+            raise MemobenchError(f"its cameras have different sizes: {', '.join(map(str, sorted(sizes)))}")
         return PublishedDemo(
             group=name,
             states=_finite("states", states[:]),
             actions=_finite("actions", actions[:]).astype(np.float32),
-            metadata=_json_object(_text_attribute(group, "meta_data", required=True), "meta_data"),
+            metadata=_metadata(_text_attribute(group, "meta_data", required=True)),
             model_file=_text_attribute(group, "model_file") or "",
             image_size=sizes.pop(),
         )
 
     def images(self, group: str, rows: int = 1, columns: int = 1) -> Iterator[dict[str, NDArray[np.uint8]]]:
-        """Yield both cameras' frames, (H, W, 3) uint8, in order; ``FRAMES_PER_READ`` are in memory at a time.
-
-        -1 as ``rows`` or ``columns`` turns the images upside down, or mirrors them left to right.
-        """
+        """Yield both cameras' frames, (H, W, 3) uint8; -1 as ``rows`` turns them upside down, ``columns`` mirrors."""
         obs = self._data[group]["obs"]
         names = _image_names(obs)
         for start in range(0, len(obs[names["image"]]), FRAMES_PER_READ):
             try:
                 block = {camera: obs[name][start : start + FRAMES_PER_READ] for camera, name in names.items()}
             except Exception as error:  # h5py raises OSError, KeyError, RuntimeError or ValueError for damage
-                raise Unusable(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
+                raise MemobenchError(f"its images cannot be read from frame {start} on ({first_line(error)})") from None
             for offset in range(len(block["image"])):
                 frame = {camera: frames[offset] for camera, frames in block.items()}
                 yield {c: np.ascontiguousarray(image[::rows, ::columns]) for c, image in frame.items()}
@@ -179,7 +156,7 @@ class PublishedFile:
 
 
 def _open_error(path: Path, error: OSError) -> str:
-    """Return why a file cannot be opened. HDF5 reports locks and Git LFS pointers like damage."""
+    # HDF5 reports locks and Git LFS pointers like damage.
     if isinstance(error, FileNotFoundError):
         return "there is no such file"
     try:
@@ -191,59 +168,32 @@ def _open_error(path: Path, error: OSError) -> str:
     return f"it is no HDF5 file, or was cut off ({first_line(error)})"
 
 
-def _check_own(file: h5py.File) -> None:
-    """Refuse a file with content of others: HDF5 would read any file that its external links and arrays name."""
+def _outside(name: str, member: Any) -> str | None:
     import h5py
 
-    def outside(name: str, member: Any) -> str | None:
-        is_array = isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)
-        return name if is_array or isinstance(member, h5py.ExternalLink) else None
-
-    name = file.visititems_links(outside) or file.visititems(outside)
-    if name:
-        raise Unusable(f"{name!r} is read from another file (a link, external storage or a virtual array); copy it in")
-
-
-def _check_layout(data: h5py.Group) -> None:
-    """Refuse a file of LIBERO or robomimic, whose layouts are similar, and name the missing parts."""
-    import h5py
-
-    first = next((data.get(name) for name in data if demo_number(name) is not None), None)
-    obs = first.get("obs") if isinstance(first, h5py.Group) else None
-    if first is None or not isinstance(obs, h5py.Group) or "meta_data" in first.attrs:
-        return
-    lacks = [f"the attribute {key!r}" for key in ("bddl_file_name", "bddl_file_content") if key not in data.attrs]
-    lacks += [f"the array 'obs/{name}'" for name in IMAGE_NAMES.values() if name not in obs]
-    layout = "LIBERO's" if "agentview_rgb" in obs else "robomimic's" if "env_args" in data.attrs else None
-    if layout is not None:
-        raise Unusable(
-            f"it is in {layout} layout, which lacks {', '.join(['the checkpoints (meta_data)', *lacks])}; train on it "
-            "with LeRobot's own datasets, or describe its task as docs/develop/add_a_task.md shows"
-        )
+    is_array = isinstance(member, h5py.Dataset) and (member.external or member.is_virtual)
+    return name if is_array or isinstance(member, h5py.ExternalLink) else None
 
 
 def _check_length(group: h5py.Group, arrays: Mapping[str, h5py.Dataset]) -> None:
     lengths = {key: len(array) for key, array in arrays.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{key} {length}" for key, length in lengths.items())
-        raise Unusable(f"its arrays have different lengths: {listed}")
+        raise MemobenchError(f"its arrays have different lengths: {listed}")
     length = lengths["states"]
     if not length:
-        raise Unusable("it has no frames")
+        raise MemobenchError("it has no frames")
     count = group.attrs.get("num_samples")
-    if count is None:
-        raise Unusable("the attribute 'num_samples' is missing")
     if not isinstance(count, int | np.integer) or int(count) != length:
-        raise Unusable(f"num_samples is {count}, but its arrays have {length} frames")
+        raise MemobenchError(f"num_samples is {count}, but its arrays have {length} frames")
 
 
 def _is_file_object(text: str) -> bool:
-    """Return whether a text is Python's representation of an open file, which LIBERO's script stores by mistake."""
+    # LIBERO's script stores Python's representation of an open file by mistake.
     return FILE_OBJECT.fullmatch(text.strip()) is not None
 
 
-def _image_names(obs: h5py.Group) -> dict[str, str]:
-    """Return camera to array of a group of observations: the published names, or LIBERO's."""
+def _image_names(obs: Collection[str]) -> dict[str, str]:
     published = any(name in obs for name in IMAGE_NAMES.values())
     return LIBERO_NAMES if not published and any(name in obs for name in LIBERO_NAMES.values()) else IMAGE_NAMES
 
@@ -255,24 +205,34 @@ def demo_number(name: str) -> int | None:
 
 
 def _text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
-    value = _plain(group.attrs.get(key))
+    value = group.attrs.get(key)
+    if isinstance(value, np.ndarray) and value.shape == (1,):
+        value = value[0]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bytes):  # HDF5 has texts of several types
+        value = value.decode("utf-8", errors="replace")
     if value is None and required:
-        raise Unusable(f"the attribute {key!r} is missing")
+        raise MemobenchError(f"the attribute {key!r} is missing")
     if value is not None and not isinstance(value, str):
-        raise Unusable(f"the attribute {key!r} is of type {type(group.attrs[key]).__name__}, expected text")
+        raise MemobenchError(f"the attribute {key!r} is of type {type(group.attrs[key]).__name__}, expected text")
     return value
 
 
-def _json_object(text: str, name: str) -> dict[str, Any]:
+class Metadata(TypedDict):
+    """Frames in ``meta_data``, -1 where unknown."""
+
+    key_frame: NotRequired[list[int]]
+    timestep_exec_start_idx: NotRequired[int | Annotated[list[int], MinLen(1)]]
+
+
+def _metadata(text: str) -> dict[str, Any]:
     if _is_file_object(text):
-        raise Unusable(f"{name} holds {text[:60]!r}, the name of a Python object instead of its text")
+        raise MemobenchError(f"meta_data holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
-        value = parsed(text)
+        return dict(checked(parsed(text), Metadata))
     except Malformed as error:
-        raise Unusable(f"{name} is no valid JSON: {error}") from None
-    if not isinstance(value, dict):
-        raise Unusable(f"{name} holds a {type(value).__name__}, expected a JSON object")
-    return value
+        raise MemobenchError(f"meta_data is no valid JSON of a task: {error}") from None
 
 
 def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes: Any) -> h5py.Dataset:
@@ -280,17 +240,17 @@ def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes:
 
     array = group.get(name)
     if not isinstance(array, h5py.Dataset):
-        raise Unusable(f"the array {name!r} is missing")
+        raise MemobenchError(f"the array {name!r} is missing")
     if array.dtype not in [np.dtype(dtype) for dtype in dtypes]:
         expected = " or ".join(str(np.dtype(dtype)) for dtype in dtypes)
-        raise Unusable(f"{name} has type {array.dtype}, expected {expected}")
+        raise MemobenchError(f"{name} has type {array.dtype}, expected {expected}")
     if len(array.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
         expected = ", ".join("any" if n is None else str(n) for n in shape)
-        raise Unusable(f"{name} has shape {array.shape}, expected ({expected})")
+        raise MemobenchError(f"{name} has shape {array.shape}, expected ({expected})")
     stored = array.id.get_create_plist()
     for number, _, _, label in (stored.get_filter(k) for k in range(stored.get_nfilters())):
         if not h5py.h5z.filter_avail(number):
-            raise Unusable(
+            raise MemobenchError(
                 f"{name} is compressed by the HDF5 filter {number} {label.decode(errors='replace')!r}, which is not "
                 "installed; set HDF5_PLUGIN_PATH to the folder of its plugin, or rewrite it with `h5repack -f NONE`"
             )
@@ -300,19 +260,10 @@ def _array(group: h5py.Group, name: str, shape: tuple[int | None, ...], *dtypes:
 def _finite(name: str, values: NDArray) -> NDArray:
     bad = np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))
     if bad.size:
-        raise Unusable(f"{name} holds a value at frame {bad[0]} that is not finite or beyond {LARGEST:g}")
+        raise MemobenchError(f"{name} holds a value at frame {bad[0]} that is not finite or beyond {LARGEST:g}")
     return values
 
 
 def first_line(error: BaseException) -> str:
     """Return the first line of an error's message, or its name."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def _plain(value: Any) -> Any:
-    """Return an attribute as a Python value. HDF5 has numbers of many types, and texts as bytes or arrays of one."""
-    if isinstance(value, np.ndarray) and value.shape == (1,):
-        value = value[0]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return value.decode("utf-8", errors="replace") if isinstance(value, bytes) else value

@@ -22,8 +22,7 @@ from lerobot_memobench.io import cache_folder, files_below
 from lerobot_memobench.sim.convention import MIRRORED
 from lerobot_memobench.sim.object_layout import NAMES
 
-STAGING = ".staging"
-"""Folder of an unfinished run within its destination."""
+STAGING = ".staging"  # folder of an unfinished run within its destination
 DEFAULT_REPO_ID = "memobench/memobench"
 MANIFEST_FILE = "manifest.json"
 INFO_FILE = Path("meta") / "info.json"
@@ -47,14 +46,11 @@ def dataset_files(folder: Path) -> list[str]:
 
 
 def without_pattern(folder: Path) -> Path:
-    """Return a path of a dataset's folder for LeRobot, which reads names such as ``obj [v2]`` as patterns of `glob`.
-
-    It is the folder itself, or a link to it in the cache. The link is the same at every call, because LeRobot caches
-    the tables by path.
-    """
+    """Return a dataset's folder, or a link to it in the cache: LeRobot reads names like ``obj [v2]`` as patterns."""
     path = str(folder.absolute())
     if glob.escape(path) == path or not folder.is_dir():
         return folder
+    # LeRobot caches tables by path, so the link is the same at every call.
     link = cache_folder() / "datasets" / hashlib.sha256(os.fsencode(path)).hexdigest()[:16]
     link.parent.mkdir(parents=True, exist_ok=True)
     with suppress(FileExistsError):
@@ -62,10 +58,8 @@ def without_pattern(folder: Path) -> Path:
     return link
 
 
-EPISODE_INFO = "episode_info"
-"""Column of frames with the episode's record at its first frame, empty elsewhere."""
-LANGUAGE = "language_persistent"
-"""LeRobot's column of language rows."""
+EPISODE_INFO = "episode_info"  # column of frames with the episode's record at its first frame, empty elsewhere
+LANGUAGE = "language_persistent"  # LeRobot's column of language rows
 OBJECTS = "observation.environment_state"
 """Column of visible objects in datasets without images; LeRobot uses a column of this name as an input."""
 PRIVILEGED = "privileged.environment_state"

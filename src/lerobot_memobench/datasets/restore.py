@@ -14,9 +14,8 @@ from __future__ import annotations
 import json
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from itertools import product
 from pathlib import Path, PurePosixPath
 
 import mujoco
@@ -26,7 +25,7 @@ from PIL import Image
 
 from lerobot_memobench.constants import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.datasets.demonstration import Demonstration
-from lerobot_memobench.datasets.hdf5 import NO_SEED, SUFFIX, PublishedDemo, PublishedFile, Unusable, first_line
+from lerobot_memobench.datasets.hdf5 import NO_SEED, SUFFIX, PublishedDemo, PublishedFile, first_line
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_name
 from lerobot_memobench.sim.asset import TABLE_TOP
@@ -38,16 +37,13 @@ from lerobot_memobench.tasks.progress import HOLD_STEPS, Evaluator
 from lerobot_memobench.tasks.task import BDDL_FILE, MEMORY_TYPES, METADATA_FILE, REFERENTS, Task
 
 States = NDArray[np.float64]
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
+Pose = NDArray[np.float64]  # position and quaternion wxyz, (7,)
 
 BASE = "robot0_base"
-BASE_TOLERANCE = 1e-3
-"""Largest distance of the arm's base from ours, m."""
+BASE_TOLERANCE = 1e-3  # largest distance of the arm's base from ours, m
 NEAR_TABLE = 0.1
 """Largest height of a fixture's origin above or below the table's top, m; LIBERO's are up to 30 mm above it."""
-UNKNOWN = "tasks"
-"""Folder of a task with an unknown memory type."""
+UNKNOWN = "tasks"  # folder of a task with an unknown memory type
 
 
 # --- demonstrations ---
@@ -56,7 +52,8 @@ UNKNOWN = "tasks"
 def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     """Return the demonstration of a checked group, without images.
 
-    `Unusable` if the group contradicts itself or the task, or is of another scene than the task's.
+    Raises:
+        MemobenchError: the group contradicts itself or the task, or is of another scene than the task's.
     """
     sim = _simulation(task)
     states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
@@ -66,77 +63,60 @@ def restore(task: Task, demo: PublishedDemo) -> Demonstration:
     evaluate = not frames or min(frames) < 0
     proprio, objects, satisfied, success = _read_states(sim, task, states, fixture_poses, exec_start, evaluate)
     known = np.arange(len(states))[:, None] >= np.array(frames)  # from the key frame on if it is known
-    try:
-        return Demonstration(
-            task=task,
-            seed=NO_SEED,
-            referent=REFERENTS[0],
-            variant=0,
-            states=states,
-            actions=demo.actions,
-            proprio=proprio,
-            images=None,
-            exec_start=exec_start,
-            satisfied=np.where(np.array(frames, dtype=int) >= 0, known, satisfied),
-            success=success or not evaluate,
-            fixture_poses=fixture_poses,
-            scene_hash="",
-            stand_ins=sim.stand_ins,
-            objects=objects,
-        )
-    except MemobenchError as error:
-        raise Unusable(str(error)) from None
+    return Demonstration(
+        task=task,
+        seed=NO_SEED,
+        referent=REFERENTS[0],
+        variant=0,
+        states=states,
+        actions=demo.actions,
+        proprio=proprio,
+        images=None,
+        exec_start=exec_start,
+        satisfied=np.where(np.array(frames, dtype=int) >= 0, known, satisfied),
+        success=success or not evaluate,
+        fixture_poses=fixture_poses,
+        stand_ins=sim.stand_ins,
+        objects=objects,
+    )
 
 
 def _execution_start(task: Task, demo: PublishedDemo) -> int:
-    """Return the frame at which execution starts.
-
-    If ``timestep_exec_start_idx`` is missing (-1) it is 0 for a task without demonstration prompt, else the last frame
-    whose state equals the first one.
-    """
-    value = demo.metadata.get("timestep_exec_start_idx", -1)
-    values = value if isinstance(value, list) else [value]
-    if not values or not all(isinstance(item, int) and not isinstance(item, bool) for item in values):
-        raise Unusable(f"meta_data has timestep_exec_start_idx {value!r}, expected a frame or -1")
-    start = max(values)
+    value: int | list[int] = demo.metadata.get("timestep_exec_start_idx", -1)
+    start = max(value) if isinstance(value, list) else value
     if start >= len(demo.states):
-        raise Unusable(f"execution starts at frame {start}, but it has {len(demo.states)} frames")
+        raise MemobenchError(f"execution starts at frame {start}, but it has {len(demo.states)} frames")
     if start >= 0:
         return start
     if task.prompt is None:
         return 0
+    # A prompt ends by returning the scene to its start.
     back = np.flatnonzero((demo.states[1:, 1:] == demo.states[0, 1:]).all(axis=1)) + 1
     if back.size:
         return int(back[-1])
-    raise Unusable(
+    raise MemobenchError(
         "timestep_exec_start_idx is -1 for a task with a demonstration prompt, and no later frame shows the scene in "
         "its start state: write the frame at which execution starts into meta_data"
     )
 
 
 def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
-    frames = demo.metadata.get("key_frame", [-1] * len(task.checkpoints))
-    if (
-        not isinstance(frames, list)
-        or len(frames) != len(task.checkpoints)
-        or not all(isinstance(frame, int) and not isinstance(frame, bool) for frame in frames)
-    ):
-        raise Unusable(f"meta_data has key_frame {frames!r}, expected {len(task.checkpoints)} frames, -1 where unknown")
+    count, length = len(task.checkpoints), len(demo.states)
+    frames: list[int] = demo.metadata.get("key_frame", [-1] * count)
+    if len(frames) != count:
+        raise MemobenchError(f"meta_data has key_frame {frames!r}, expected {count} frames, -1 where unknown")
     known = [frame for frame in frames if frame >= 0]
     if known != sorted(known):
-        raise Unusable(f"key_frame {frames} is not in order: checkpoints are completed one after the other")
-    if any(not exec_start <= frame < len(demo.states) for frame in known):
-        raise Unusable(f"key_frame {frames} is outside of the execution, frames {exec_start} to {len(demo.states) - 1}")
+        raise MemobenchError(f"key_frame {frames} is not in order: checkpoints are completed one after the other")
+    if any(not exec_start <= frame < length for frame in known):
+        raise MemobenchError(f"key_frame {frames} is outside of the execution, frames {exec_start} to {length - 1}")
     return frames
 
 
 def _read_states(
     sim: Simulation, task: Task, states: States, fixture_poses: dict[str, Pose], exec_start: int, evaluate: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], bool]:
-    """Return proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K) and success at states set in order.
-
-    The last two are false if ``evaluate`` is.
-    """
+    # Proprioception (T, 8), objects (T, SIZE), truth of checkpoints (T, K) and success; without ``evaluate`` false.
     goals = [task.goal, *(checkpoint.goal for checkpoint in task.checkpoints)]
     evaluator = Evaluator(goals, HOLD_STEPS // UPSTREAM_EVALUATIONS)
     look = ObjectSlots(sim)
@@ -156,11 +136,8 @@ def _read_states(
 
 
 def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
-    """Raise if the frames are not in the order of their time, which may restart at the end of the prompt.
-
-    The end of the prompt is the start of the execution, or, if the scene rests before it, the first frame of the rest.
-    Only an evenly running time is checked: other programs leave zeros or other numbers there.
-    """
+    """Raise if time runs backwards, except at the end of the prompt, the first frame of a rest before the execution."""
+    # Only an evenly running time is checked: other programs leave zeros or other numbers there.
     time = states[:, 0]
     ticks = np.unique(np.round(time, 5))
     if len(ticks) < 3 or np.ptp(np.diff(ticks)) > 0.01 * np.diff(ticks).mean():
@@ -169,7 +146,7 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
     rest = int(moving[-1]) + 1 if moving.size else 0
     back = [int(frame) for frame in np.flatnonzero(np.diff(time) < 0) + 1 if frame != rest]
     if back:
-        raise Unusable(
+        raise MemobenchError(
             f"its states are not in order: frame {back[0]} is earlier ({time[back[0]]:.2f} s) than the one before it "
             f"({time[back[0] - 1]:.2f} s)"
         )
@@ -178,29 +155,29 @@ def _check_clock(states: NDArray[np.float64], exec_start: int) -> None:
 @lru_cache(maxsize=1)
 def _simulation(task: Task) -> Simulation:
     # The last one is cached, because a file's demonstrations follow each other.
-    try:
-        sim = Simulation(task)
-    except MemobenchError as error:
-        raise Unusable(str(error)) from None
+    sim = Simulation(task)
     sim.reset(0)
     return sim
 
 
 # --- the orientation of stored images ---
 
-STORED = (UPRIGHT, "mirrored left to right", "upside down", "rotated by 180 degrees")
-ORIENTATIONS = {name: (rows, columns) for name, (rows, columns) in zip(STORED, product((1, -1), repeat=2), strict=True)}
+ORIENTATIONS = {
+    UPRIGHT: (1, 1),
+    "mirrored left to right": (1, -1),
+    "upside down": (-1, 1),
+    "rotated by 180 degrees": (-1, -1),
+}
 """How images are stored -> steps over their rows and columns that make them upright."""
 NEAR, APART = 12.0, 2.0
 """Largest mean difference of images of one frame, of 255 levels, and the least ratio to the next orientation's."""
-SIDE = 32
-"""Side at which images are compared, pixels: edges and textures of other renderers do not count."""
+SIDE = 32  # side at which images are compared, pixels: edges and textures of other renderers do not count
 
 
 def orientation_of(file: PublishedFile, demo: PublishedDemo) -> str | None:
     """Return which of `ORIENTATIONS` the first images of a checked group have, by those drawn of its first state.
 
-    None if none is near, or two are. `Unusable` if the group has no task, or is of another scene than the task's.
+    None if none is near, or two are.
     """
     sim = _simulation(task_of(file, demo))
     states, fixture_poses = _translated(sim, compile_scene(demo.model_file), demo.states)
@@ -230,48 +207,29 @@ KEPT = {
 LEFT_OUT = ("inertial", "camera", "light", "geom", "site")
 BY_DEFAULTS = ("class", "childclass")
 """Attributes that refer to defaults elsewhere in the file; MuJoCo removes them from scenes that it saves."""
-LARGEST_NUMBER = 1e6
-JOINT_TYPES = ("free", "ball", "slide", "hinge")
-"""In MuJoCo's order."""
-WIDTHS = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1)}
-"""Joint type -> numbers of positions and velocities."""
+JOINT_TYPES = ("free", "ball", "slide", "hinge")  # in MuJoCo's order
 
 
-@dataclass(frozen=True)
-class Joint:
-    """A joint: its type, the name of the body that it moves, and its positions and velocities in a state."""
-
-    kind: str
-    body: str
-    position: slice
-    velocity: slice
-
-
-def joints_of(model: mujoco.MjModel) -> dict[str, Joint]:
-    """Return a model's joints by name, in the order of its states."""
+def joints_of(model: mujoco.MjModel) -> dict[str, tuple[str, NDArray[np.int64]]]:
+    """Return each joint's type and the columns of its positions, then velocities, in a state."""
     joints = {}
-    for index in range(model.njnt):
-        joint = model.joint(index)
-        kind = JOINT_TYPES[int(joint.type[0])]
-        # A state begins with the time.
-        position, velocity = 1 + int(joint.qposadr[0]), 1 + model.nq + int(joint.dofadr[0])
-        nq, nv = WIDTHS[kind]
-        body = model.body(int(joint.bodyid[0])).name
-        joints[joint.name] = Joint(kind, body, slice(position, position + nq), slice(velocity, velocity + nv))
+    for joint in map(model.joint, range(model.njnt)):
+        position = joint.qposadr[0] + np.arange(len(joint.qpos0))
+        velocity = model.nq + joint.dofadr[0] + np.arange(len(joint.damping))
+        columns = 1 + np.concatenate([position, velocity])  # a state begins with the time
+        joints[joint.name] = (JOINT_TYPES[int(joint.type[0])], columns)
     return joints
 
 
 def compile_scene(text: str) -> mujoco.MjModel:
-    """Return the bodies and joints of a model file, compiled with placeholder inertias, or raise `Unusable`."""
-    if not text.strip():
-        raise Unusable("the attribute 'model_file' is missing, so the order of the joints in its states is unknown")
+    """Return the bodies and joints of a model file, compiled with placeholder inertias, or raise."""
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise Unusable(f"model_file is no XML ({error})") from None
+        raise MemobenchError(f"model_file is no XML ({error})") from None
     world = root.find("worldbody")
     if root.tag != "mujoco" or world is None:
-        raise Unusable("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
+        raise MemobenchError("model_file is no MJCF: it has no <mujoco> with a <worldbody>")
     scene = ElementTree.Element("mujoco")
     angles = {"angle": "degree", "eulerseq": "xyz"}
     for compiler in root.iterfind("compiler"):
@@ -279,13 +237,9 @@ def compile_scene(text: str) -> mujoco.MjModel:
     ElementTree.SubElement(scene, "compiler", {"inertiafromgeom": "false", "autolimits": "false", **angles})
     _copy_bodies(world, ElementTree.SubElement(scene, "worldbody"))
     try:
-        model = mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
+        return mujoco.MjModel.from_xml_string(ElementTree.tostring(scene, encoding="unicode"))
     except (ValueError, mujoco.FatalError) as error:
-        raise Unusable(f"MuJoCo cannot compile model_file ({first_line(error)})") from None
-    numbers = np.concatenate([model.body_pos.ravel(), model.body_quat.ravel(), model.jnt_pos.ravel(), model.qpos0])
-    if not (np.abs(numbers) <= LARGEST_NUMBER).all():
-        raise Unusable(f"model_file has a number that is not finite or beyond {LARGEST_NUMBER:g}")
-    return model
+        raise MemobenchError(f"MuJoCo cannot compile model_file ({first_line(error)})") from None
 
 
 def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> None:
@@ -294,10 +248,10 @@ def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> No
         if tag in LEFT_OUT:
             continue
         if tag not in KEPT:
-            raise Unusable(f"model_file has a <{str(tag)[:40]}> in its worldbody, which is not supported there")
+            raise MemobenchError(f"model_file has a <{str(tag)[:40]}> in its worldbody, which is not supported there")
         unread = next((key for key in BY_DEFAULTS if key in element.attrib), None)
         if unread is not None:
-            raise Unusable(
+            raise MemobenchError(
                 f"model_file's {tag} {name[:200]!r} has the attribute {unread!r}, which is not read; store the scene "
                 "as MuJoCo saves it"
             )
@@ -312,66 +266,62 @@ def _body_of(scene: mujoco.MjModel, instance: str) -> str:
     for name in (f"{instance}_main", instance):  # the suffix is robosuite's
         if mujoco.mj_name2id(scene, mujoco.mjtObj.mjOBJ_BODY, name) >= 0:
             return name
-    raise Unusable(f"model_file has no body {instance!r}, which its task has")
+    raise MemobenchError(f"model_file has no body {instance!r}, which its task has")
 
 
 def _translated(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple[States, dict[str, Pose]]:
     """Return states (T, D) of a model file's scene as states of a simulation's, and the poses of its fixtures."""
     theirs, ours, task_name = joints_of(scene), joints_of(sim.model), sim.task.name
-    for name, joint in ours.items():
+    for name, (kind, _) in ours.items():
         if name not in theirs:
-            raise Unusable(f"model_file has no joint {name!r}, which task {task_name} has")
-        if theirs[name].kind != joint.kind:
-            raise Unusable(f"model_file's joint {name!r} is of type {theirs[name].kind!r}, expected {joint.kind!r}")
+            raise MemobenchError(f"model_file has no joint {name!r}, which task {task_name} has")
+        if theirs[name][0] != kind:
+            raise MemobenchError(f"model_file's joint {name!r} is of type {theirs[name][0]!r}, expected {kind!r}")
     beyond = next((name for name in theirs if name not in ours), None)
     if beyond is not None:
-        raise Unusable(
-            f"model_file moves the body {theirs[beyond].body!r} by the joint {beyond!r}, which task {task_name} does "
-            "not have"
+        body = scene.body(scene.joint(beyond).bodyid[0]).name
+        raise MemobenchError(
+            f"model_file moves the body {body!r} by the joint {beyond!r}, which task {task_name} does not have"
         )
     width = 1 + scene.nq + scene.nv
     if states.shape[1] != width:
-        raise Unusable(f"states have width {states.shape[1]}, expected {width} of the joints of model_file")
+        raise MemobenchError(f"states have width {states.shape[1]}, expected {width} of the joints of model_file")
     expected = np.array(sim.model.body(BASE).pos)
     base = np.array(scene.body(_body_of(scene, BASE)).pos)
-    if np.abs(expected - base).max() > BASE_TOLERANCE:
-        raise Unusable(
+    if not np.abs(expected - base).max() <= BASE_TOLERANCE:  # also if it is not a number
+        raise MemobenchError(
             f"model_file has the arm's base {BASE!r} at {base.round(3).tolist()}, expected "
             f"{expected.round(3).tolist()}: it is of another scene than the benchmark's"
         )
     translated = np.zeros((len(states), sim.state_dim))
     translated[:, 0] = states[:, 0]
-    for name, joint in ours.items():
-        translated[:, joint.position] = states[:, theirs[name].position]
-        translated[:, joint.velocity] = states[:, theirs[name].velocity]
-    return translated, {name: _fixture_pose(scene, name) for name in sim.fixture_poses()}
-
-
-def _fixture_pose(scene: mujoco.MjModel, name: str) -> Pose:
-    body = scene.body(_body_of(scene, name))
-    pose = np.concatenate([body.pos, body.quat])
-    if abs(pose[2] - TABLE_TOP) > NEAR_TABLE:
-        raise Unusable(
-            f"model_file has {name!r} at {pose[:3].round(3).tolist()}, not on the table at {TABLE_TOP} m: it is the "
-            "scene before its fixtures were set up; store the scene of the simulation"
-        )
-    return pose
+    for name, (_, columns) in ours.items():
+        translated[:, columns] = states[:, theirs[name][1]]
+    poses = {}
+    for name in sim.fixture_poses():
+        body = scene.body(_body_of(scene, name))
+        if not abs(body.pos[2] - TABLE_TOP) <= NEAR_TABLE:
+            raise MemobenchError(
+                f"model_file has {name!r} at {body.pos.round(3).tolist()}, not on the table at {TABLE_TOP} m: it is "
+                "the scene before its fixtures were set up; store the scene of the simulation"
+            )
+        poses[name] = np.concatenate([body.pos, body.quat])
+    return translated, poses
 
 
 # --- the task ---
 
 
 def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
-    """Return the task that a demonstration shows, from the file's own BDDL and metadata, or raise `Unusable`."""
+    """Return the task that a demonstration shows, from the file's own BDDL and metadata, or raise."""
     path = PurePosixPath(file.bddl_name.replace("\\", "/"))
     name = file.path.name.removesuffix(SUFFIX).removesuffix(file.path.suffix)
     if path.name == BDDL_FILE and path.parent.name not in ("", "..", "."):
         name = path.parent.name
     elif path.stem not in ("", "..", "task_config"):
         name = path.stem
-    name, known = _folder_name(name, "the task's name"), None
-    if name in task_names(suite=None):
-        known = get_task(name)
+    name = file_name(name, "the task's name")
+    known = get_task(name) if name in task_names(suite=None) else None
     metadata = dict(demo.metadata)
     # The frames differ between demonstrations, the task must not: its scene is compiled once.
     goals = metadata.get("subtask_goals")
@@ -379,11 +329,11 @@ def task_of(file: PublishedFile, demo: PublishedDemo) -> Task:
     metadata["timestep_exec_start_idx"] = -1
     folders = reversed([*path.parts, *file.path.resolve().parts])
     stated = known.memory_type if known else next((folder for folder in folders if folder in MEMORY_TYPES), UNKNOWN)
-    memory_type = _folder_name(file.attribute("memory_type") or stated, "memory_type")
+    memory_type = file_name(file.attribute("memory_type") or stated, "memory_type")
     bddl_text = file.bddl_text
     if file.lacks_its_text:  # the file stores the name of an open file instead
         if known is None:
-            raise Unusable(
+            raise MemobenchError(
                 f"bddl_file_content holds {bddl_text[:60]!r}, the name of a Python object instead of the task's text, "
                 f"and the catalogue has no task {name!r}; write the text into it"
             )
@@ -401,7 +351,7 @@ def unlike_the_catalogue(task: Task) -> str | None:
     if task.name not in task_names(suite=None):
         return None
     known = get_task(task.name)
-    parts = {
+    same = {
         "memory type": task.memory_type == known.memory_type,
         "instruction": task.language == known.language,
         "objects": (task.objects, task.fixtures) == (known.objects, known.fixtures),
@@ -409,20 +359,13 @@ def unlike_the_catalogue(task: Task) -> str | None:
         "goal": task.goal == known.goal,
         "checkpoints": task.checkpoints == known.checkpoints,
     }
-    differs = [name for name, same in parts.items() if not same]
+    differs = [part for part, is_same in same.items() if not is_same]
     if not differs:
         return None
     return (
         f"not as the catalogue's {task.name}: {', '.join(differs)}; the dataset holds the file's, but `lerobot eval` "
         "and `memobench validate` know the catalogue's by that name"
     )
-
-
-def _folder_name(text: str, role: str) -> str:
-    try:
-        return file_name(text, role)
-    except MemobenchError as error:
-        raise Unusable(str(error)) from None
 
 
 @lru_cache(maxsize=64)
@@ -436,4 +379,4 @@ def _load(name: str, memory_type: str, bddl_text: str, metadata: str) -> Task:
             return load_task(folder)
         except MemobenchError as error:
             message = str(error).replace(str(folder / METADATA_FILE), "meta_data")
-            raise Unusable(message.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None
+            raise MemobenchError(message.replace(str(folder / BDDL_FILE), "bddl_file_content")) from None

@@ -17,10 +17,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,20 +30,18 @@ from pydantic import BaseModel, Field
 from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
-from lerobot_memobench.datasets.layout import STAGING, TOP_LEVEL, image_key, is_dataset
+from lerobot_memobench.datasets.layout import MANIFEST_FILE, STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError, short
-from lerobot_memobench.io import file_hash, refuse_links, remove_drafts, write_file
-from lerobot_memobench.jobs.processes import HeldError, locked
+from lerobot_memobench.io import file_hash, flush_to_disk, refuse_links, remove_drafts, write_file
+from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
 from lerobot_memobench.untrusted import read_json
 
 TEMPORARY = ".tmp-"
-REQUEST_FILE = "request.json"
 EPISODE_FILE = "episode.json"
 ARRAYS_FILE = "arrays.npz"
-FINISHED_EARLY = "finished_early"
-"""Key of a dataset's request: whether episodes of it were left out."""
+FINISHED_EARLY = "finished_early"  # key of a dataset's request: whether episodes of it were left out
 ADVICE = "it is damaged; delete its folder and run the command again"
 
 
@@ -58,7 +55,6 @@ class StagedEpisode(BaseModel):
         failure: why there is no demonstration of this seed, or None.
         info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
             episode at least its task's name and seed.
-        language_persistent: LeRobot's persistent language rows (`persistent_rows`).
         image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
         files: name to sha256 of the other files.
     """
@@ -80,7 +76,7 @@ class StagedEpisode(BaseModel):
         return DemonstrationRecord.model_validate(self.info | {"versions": versions})
 
     def video(self, camera: str) -> Path:
-        """Return the file of a camera's video."""
+        """Return the path of a camera's video."""
         return self.folder / f"{camera}.mp4"
 
     def camera_stats(self) -> dict[str, Stats]:
@@ -148,7 +144,10 @@ class EpisodeStage:
 
     def __init__(self, folder: Path, convention: str = UPRIGHT) -> None:
         self._folder, self._convention = folder, convention
-        self._temporary = _temporary_folder(folder)
+        # Two workers may make the same episode, so each has a name of its own. A killed worker's folder is removed with
+        # the staging folder.
+        self._temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
+        self._temporary.mkdir(parents=True)
         names = CONVENTIONS[convention].values()
         self._videos = {name: VideoWriter(self._temporary / f"{name}.mp4") for name in names}
         self._histograms = {name: ImageHistograms() for name in names}
@@ -160,7 +159,7 @@ class EpisodeStage:
     def __exit__(self, *_: object) -> None:
         for video in self._videos.values():
             with contextlib.suppress(Exception):  # on a full disk closing fails as well, and all files are deleted
-                video.abandon()
+                video.close(flush=False)
         shutil.rmtree(self._temporary, ignore_errors=True)
 
     def add_images(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
@@ -172,15 +171,10 @@ class EpisodeStage:
 
     def publish(self, demo: Demonstration) -> StagedEpisode:
         """Write everything except the images, which were added before, and give the folder its name."""
-        if self._frames not in (0, len(demo)):
-            raise MemobenchError(
-                f"{demo.task.name}, seed {demo.seed}: {self._frames} images of a demonstration of {len(demo)} frames "
-                "were recorded; add one per frame and camera, or none"
-            )
+        assert self._frames in (0, len(demo)), "add images of each frame, or of none"
         columns = labels(demo)
         record = DemonstrationRecord.of(demo).model_dump(exclude={"versions"})
         info = record | {"language": demo.task.language, "frames": len(demo)}
-        _check_storable(info, columns)
         for video in self._videos.values():
             video.close()
         stats = {
@@ -196,20 +190,30 @@ class EpisodeStage:
             **columns,
         }
         np.savez_compressed(self._temporary / ARRAYS_FILE, **arrays)
-        return _publish(self._temporary, self._folder, None, info, persistent_rows(columns), stats)
+        return self._publish(info, None, persistent_rows(columns), stats)
 
-
-def _check_storable(info: Mapping[str, Any], columns: Mapping[str, Any]) -> None:
-    """Raise unless a dataset's tables can hold the episode; otherwise the assembly of all episodes would fail."""
-    texts = [sorted(set(values)) for values in columns.values() if isinstance(values, list)]
-    try:
-        json.dumps([info, texts], ensure_ascii=False).encode()
-        np.array([info["seed"], info["variant"]], dtype=np.int64)
-    except (UnicodeEncodeError, OverflowError) as error:
-        raise MemobenchError(
-            f"{info['task_name']!r}: a text that is no Unicode, or a number of more than 64 bits, cannot be stored "
-            f"({error}); correct the task's texts or the seed"
-        ) from None
+    def _publish(
+        self, info: dict[str, Any], failure: str | None, rows: list[LanguageRow], image_stats: dict[str, Any]
+    ) -> StagedEpisode:
+        episode = StagedEpisode(
+            failure=failure,
+            info=info,
+            language_persistent=rows,
+            image_stats=image_stats,
+            files={path.name: file_hash(path) for path in sorted(self._temporary.iterdir())},
+            folder=self._folder,
+        )
+        (self._temporary / EPISODE_FILE).write_text(episode.model_dump_json())
+        flush_to_disk(*self._temporary.iterdir(), self._temporary)  # a complete folder never has incomplete files
+        try:
+            self._temporary.rename(self._folder)
+        except OSError:
+            staged = read_staged(self._folder)  # another worker was first
+            if staged is None or staged.info != info:
+                raise MemobenchError(f"{self._folder} holds another episode; delete it and run again") from None
+            return staged
+        flush_to_disk(self._folder.parent)
+        return episode
 
 
 def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
@@ -223,63 +227,8 @@ def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPR
 
 def stage_failure(info: dict[str, Any], reason: str, folder: Path) -> StagedEpisode:
     """Store the reason why a seed has no demonstration, so that a resumed run reports it as well."""
-    temporary = _temporary_folder(folder)
-    try:
-        return _publish(temporary, folder, reason, info, [], {})
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _publish(
-    temporary: Path,
-    folder: Path,
-    failure: str | None,
-    info: dict[str, Any],
-    language_rows: list[LanguageRow],
-    image_stats: dict[str, Any],
-) -> StagedEpisode:
-    """Add the record, flush everything to the disk, then give the folder its name."""
-    files = {path.name: file_hash(path) for path in sorted(temporary.iterdir())}
-    episode = StagedEpisode(
-        failure=failure,
-        info=info,
-        language_persistent=language_rows,
-        image_stats=image_stats,
-        files=files,
-        folder=folder,
-    )
-    (temporary / EPISODE_FILE).write_text(episode.model_dump_json())
-    flush_to_disk([*temporary.iterdir(), temporary])
-    try:
-        temporary.rename(folder)
-    except OSError:
-        staged = read_staged(folder)  # another worker was first
-        if staged is None or staged.info != info:
-            raise MemobenchError(f"{folder} holds another episode; delete it and run again") from None
-        return staged
-    flush_to_disk([folder.parent])
-    return episode
-
-
-def _temporary_folder(folder: Path) -> Path:
-    """Make and return an empty folder, to be renamed to ``folder`` when it is complete.
-
-    Killed workers leave such folders, which are removed with the staging folder.
-    """
-    # Two workers may make the same episode, so each has a name of its own.
-    temporary = folder.parent / f"{TEMPORARY}{folder.name}-{secrets.token_hex(4)}"
-    temporary.mkdir(parents=True)
-    return temporary
-
-
-def flush_to_disk(paths: Iterable[Path]) -> None:
-    """Wait until the disk holds files, or the entries of folders."""
-    for path in paths:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    with EpisodeStage(folder) as stage:
+        return stage._publish(info, reason, [], {})
 
 
 # --- the run ---
@@ -308,11 +257,12 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
 
     Episodes of an unfinished run of the same request are kept. Another request, and a run that goes on, are refused.
     """
+    check_destination(out)
     staging = out / STAGING
     staging.mkdir(parents=True, exist_ok=True)
     with locked(staging, out):
         remove_drafts(staging)
-        path = staging / REQUEST_FILE
+        path = staging / "request.json"
         try:
             earlier = read_json(path, dict[str, Any], "delete its folder to start again")
         except FileNotFoundError:
@@ -325,30 +275,22 @@ def episodes_folder(out: Path, request: dict[str, Any]) -> Iterator[Path]:
         yield folder.absolute()
 
 
-def finished_manifest(out: Path, request: dict[str, Any], *required: str) -> dict[str, Any] | None:
+def finished_manifest(out: Path, request: dict[str, Any]) -> dict[str, Any] | None:
     """Return the manifest of a finished dataset with this request, None if ``out`` holds no dataset.
 
-    A staging folder that a kill in the last moment left is removed.
-
     Raises:
-        MemobenchError: the dataset is damaged, has another request, or another command made it, whose manifest lacks
-            a ``required`` key.
+        MemobenchError: the dataset is damaged, has another request, or another command made it.
     """
     if not is_dataset(out):
         return None
-    try:
-        manifest = read_manifest(out)
-    except FileNotFoundError:
-        manifest = {}
-    if not {"request", *required} <= set(manifest):
+    manifest = read_manifest(out) if (out / MANIFEST_FILE).exists() else {}
+    if "request" not in manifest:
         raise MemobenchError(f"{out} already holds a dataset that this command did not make; name another folder")
     # A finished dataset stays valid under newer versions.
     earlier = manifest["request"] | {key: value for key, value in request.items() if key == "versions"}
     _compare_requests(earlier, request, f"{out} already holds a finished dataset", "name another folder")
     check_whole(out)
-    staging = out / STAGING
-    with contextlib.suppress(FileNotFoundError, HeldError), locked(staging, out):
-        shutil.rmtree(staging, ignore_errors=True)
+    shutil.rmtree(out / STAGING, ignore_errors=True)  # a kill in the last moment may have left it
     return manifest
 
 

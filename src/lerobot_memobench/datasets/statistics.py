@@ -23,8 +23,7 @@ from lerobot_memobench.io import explaining_disk_errors, write_file
 from lerobot_memobench.untrusted import read_json
 
 IMAGES, TEXTS = ("video", "image"), ("string", "language")
-BLOCK = 64
-"""Images decoded at a time."""
+BLOCK = 64  # images decoded at a time
 NEEDED = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),
@@ -33,8 +32,8 @@ NEEDED = {
 }
 """LeRobot's mode of normalisation -> statistics that it uses."""
 TOLERANCE, IMAGE_TOLERANCE = 1e-3, 0.02
-"""Tolerance of statistics of numbers, as a share of the range, and of mean and deviation of images, as a share of all
-levels: the recorded ones are of images before encoding."""
+"""Tolerance of numbers, as a share of their range, and of images' mean and deviation, as a share of all levels: the
+recorded ones are of images before encoding."""
 
 
 def measured(features: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -75,10 +74,9 @@ def _image_stats(folder: Path, camera: str) -> Stats:
 
 def recorded(folder: Path) -> dict[str, dict[str, Any]]:
     """Return ``meta/stats.json``; empty where there is none."""
-    stats: dict[str, dict[str, Any]] = {}
-    if (folder / STATS_FILE).exists():
-        stats = read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True)
-    return stats
+    if not (folder / STATS_FILE).exists():
+        return {}
+    return dict(read_json(folder / STATS_FILE, dict[str, dict[str, Any]], ADVICE, nan=True))
 
 
 def check_statistics(folder: Path, names: Iterable[str]) -> None:
@@ -95,18 +93,15 @@ def check_statistics(folder: Path, names: Iterable[str]) -> None:
             bounded = key.startswith("q") or (is_image and key != "mean" and key != "std")
             least, most = (low, high) if bounded else (value.ravel(), value.ravel())
             stored = recorded_stats.get(name, {}).get(key)
-            if not (is_image and key == "count") and not _within(stored, value.size, least - slack, most + slack):
+            try:
+                numbers = np.asarray(stored, dtype=np.float64).ravel()
+            except (TypeError, ValueError):
+                numbers = np.empty(0)
+            within = numbers.size == value.size and ((least - slack <= numbers) & (numbers <= most + slack)).all()
+            if not within and not (is_image and key == "count"):
                 raise MemobenchError(
                     f"{key} of {name} is {short(stored)}, expected {short(value.tolist())} of the frames; {ADVICE}"
                 )
-
-
-def _within(stored: Any, size: int, least: Any, most: Any) -> bool:
-    try:
-        numbers = np.asarray(stored, dtype=np.float64).ravel()
-    except (TypeError, ValueError):
-        return False
-    return numbers.size == size and bool(((least <= numbers) & (numbers <= most)).all())
 
 
 def needed_by(policy: Any, features: Mapping[str, Mapping[str, Any]], imagenet: bool) -> dict[str, Collection[str]]:

@@ -31,12 +31,10 @@ from lerobot_memobench.datasets.episodes import (
     read_episode,
     read_info,
     read_manifest,
-    read_table,
     read_to_end,
 )
 from lerobot_memobench.datasets.layout import (
     ADVICE,
-    EPISODES,
     EXECUTED_ACTION,
     INFO_FILE,
     LANGUAGE,
@@ -48,9 +46,9 @@ from lerobot_memobench.datasets.layout import (
     objects_column,
 )
 from lerobot_memobench.datasets.statistics import check_statistics, measured
-from lerobot_memobench.datasets.video import FrameReader, frame_reader
-from lerobot_memobench.errors import MemobenchError, count_of, cut
-from lerobot_memobench.experts.demonstration_prompt import highlights_at
+from lerobot_memobench.datasets.video import frame_reader
+from lerobot_memobench.errors import MemobenchError, cut
+from lerobot_memobench.experts.expert import highlights_at
 from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.processes import process_pool
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, UPRIGHT, convention_of
@@ -79,38 +77,23 @@ class CheckResult:
     of_file: bool = False
 
 
-@dataclass(frozen=True)
-class _Check:
-    """A check, which returns a disagreement of an episode, or a note on a file, or None, and raises for damage."""
-
-    subject: str
-    path: Path
-    of_file: bool
-    check: Callable[[], str | None]
-
-    def run(self) -> CheckResult:
-        try:
-            with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), self.path):
-                message = self.check()
-        except MemobenchError as error:  # the other checks still run
-            return CheckResult(self.subject, str(error), of_file=self.of_file)
-        disagreement, note = (None, message) if self.of_file else (message, None)
-        return CheckResult(self.subject, disagreement, note, self.of_file)
+def _run(check: Callable[[], str | None], path: Path, subject: str, of_file: bool = False) -> CheckResult:
+    """Run a check, which returns a disagreement of an episode, or a note on a file, and raises for damage."""
+    try:
+        with refusing(lambda why: MemobenchError(f"it cannot be read ({why}); {ADVICE}"), path):
+            message = check()
+    except MemobenchError as error:  # the other checks still run
+        return CheckResult(subject, str(error), of_file=of_file)
+    return CheckResult(subject, None, message, of_file) if of_file else CheckResult(subject, message)
 
 
 def validate(
     folder: Path | str, *, workers: int = 1, progress: Callable[[int, int, CheckResult], None] = lambda *_: None
 ) -> list[CheckResult]:
-    """Replay the episodes of a dataset and check its files.
+    """Replay the episodes of a dataset and check its files (`replay`, `check_file`, `check_statistics`, …).
 
-    States, success, instruction, numbering, every checkpoint column, subgoal texts, language rows, key frames and the
-    scene must be equal; some frames of each camera must be near to those of the simulator. Every file is read to its
-    end and compared with its hash, statistics with those of the frames, and the manifest with the episodes.
-
-    ``progress`` is called after each check with the number of finished checks, their total, and the latest result.
-
-    Returns:
-        The result of each episode, in order, then of each file with a disagreement or a note.
+    Return the result of each episode, in order, then of each file with a disagreement or a note. ``progress`` is called
+    after each check with the number of finished checks, their total, and the latest result.
     """
     folder = Path(folder).absolute()
     if workers < 1:
@@ -120,9 +103,8 @@ def validate(
             f"{folder} holds no dataset (meta/info.json); name the folder of a generated one. HDF5 files are checked "
             "by `memobench convert`"
         )
-    checks = [
-        _Check(f"episode {k}", folder, False, partial(_replay_episode, folder, k)) for k in range(episode_count(folder))
-    ]
+    numbers = range(read_info(folder)["total_episodes"])
+    checks = [partial(_run, partial(_replay_episode, folder, k), folder, f"episode {k}") for k in numbers]
     checks += _file_checks(folder)
     results: dict[int, CheckResult] = {}
 
@@ -132,10 +114,10 @@ def validate(
 
     if workers == 1:
         for number, check in enumerate(checks):
-            add(number, check.run())
+            add(number, check())
     else:
         with process_pool(min(workers, len(checks))) as pool:
-            futures = {pool.submit(check.run): number for number, check in enumerate(checks)}
+            futures = {pool.submit(check): number for number, check in enumerate(checks)}
             for future in as_completed(futures):
                 add(futures[future], future.result())
     in_order = [results[number] for number in range(len(checks))]
@@ -159,14 +141,12 @@ def images_of(folder: Path, episode: int) -> Images | None:
     return read if cameras else None
 
 
-@lru_cache(maxsize=len(CAMERAS))
-def _reader(folder: Path, camera: str) -> FrameReader:
-    return frame_reader(folder, camera)
+_reader = lru_cache(maxsize=len(CAMERAS))(frame_reader)
 
 
-def _file_checks(folder: Path) -> Iterator[_Check]:
-    def of(name: Path | str, check: Callable[[], str | None]) -> _Check:
-        return _Check(Path(name).as_posix(), folder / name, True, check)
+def _file_checks(folder: Path) -> Iterator[partial[CheckResult]]:
+    def of(name: Path | str, check: Callable[[], str | None]) -> partial[CheckResult]:
+        return partial(_run, check, folder / name, Path(name).as_posix(), of_file=True)
 
     hashes = None
     with contextlib.suppress(MemobenchError, FileNotFoundError):  # `check_manifest` reports its damage
@@ -194,16 +174,6 @@ def _replay_episode(folder: Path, index: int) -> str | None:
 
 
 # --- files ---
-
-
-def episode_count(folder: Path) -> int:
-    """Return the number of episodes, on which ``meta/info.json`` and ``meta/episodes`` must agree."""
-    count, rows = int(read_info(folder)["total_episodes"]), len(read_table(folder / EPISODES, "episode_index".__eq__))
-    if rows != count:
-        raise MemobenchError(
-            f"{folder / INFO_FILE} has {count_of(count, 'episode')}, {folder}/meta/episodes {rows}; {ADVICE}"
-        )
-    return count
 
 
 def check_file(path: Path, recorded: FileHash | None) -> str | None:
@@ -289,6 +259,10 @@ Images = Callable[[Sequence[int]], dict[str, NDArray[np.uint8]]]
 """Frame numbers (n,) to the images of each camera, (n, H, W, 3)."""
 
 
+DETERMINED = {"memory_type", "family", "operations", "success", "key_frames", "scene_hash", "fixture_poses", "digest"}
+"""Fields of an episode's record that task, seed and actions determine."""
+
+
 @dataclass(frozen=True)
 class Disagreement:
     """The first difference; ``frame`` is None for a field of the whole episode."""
@@ -307,13 +281,8 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
     """Replay an episode and return the first disagreement, or None.
 
     Compared are states (if recorded), proprioception, visible objects, instruction, numbering, every label column,
-    language rows, success, key frames, and the hashes of scene and episode. The episode's hash covers the states, which
-    LeRobot's dataset tools remove.
-
-    ``images`` returns recorded images; some of them are compared.
-
-    Raises:
-        MemobenchError: there is no such task, or the actions were removed.
+    language rows, success, key frames, the hashes of scene and episode, and some of the recorded ``images``. The
+    episode's hash covers the states, which LeRobot's dataset tools remove.
     """
     record, columns = recorded.record, recorded.columns
     task = get_task(record.task_name).variant(record.variant)
@@ -321,15 +290,26 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
         raise MemobenchError("its frames have no column 'action' (a tool removed it), so it cannot be replayed")
     actions = columns["action"]
     executed, held = columns[EXECUTED_ACTION if EXECUTED_ACTION in columns else "action"], columns.get(HELD_COLUMN)
-    image_check = _ImageCheck(record.exec_start_index, len(actions), images)
-    again = resimulate(task, record.seed, executed, record.exec_start_index, image_check, held)
+    even = np.linspace(0, len(actions) - 1, FRAMES_DRAWN).round().astype(int).tolist()
+    drawn = sorted({*even, min(max(record.exec_start_index, 0), len(actions) - 1)})
+    recorded_images = {} if images is None else images(drawn)
+    height, width = next((frames.shape[1:3] for frames in recorded_images.values()), (IMAGE_SIZE, IMAGE_SIZE))
+    of_images: list[Disagreement] = []
+
+    def compare(sim: Simulation, frame: int) -> None:
+        for camera, frames in recorded_images.items() if frame in drawn and not of_images else ():
+            if difference := _unlike(sim.render(CAMERAS[camera]), frames[drawn.index(frame)]):
+                of_images.append(Disagreement(image_key(camera), frame, difference, "the simulator's image"))
+
+    render = RenderSettings(height=height, width=width)
+    again = resimulate(task, record.seed, executed, record.exec_start_index, held, render, compare)
     again = replace(again, referent=record.referent, variant=record.variant)
     if not np.array_equal(actions, executed):
         again = replace(again, actions=actions, executed=again.actions)
     columns_again = labels(again)
-    facts = {key: value for key, value in record.determined().items() if value != ""}
+    facts = {key: value for key, value in record.model_dump(include=DETERMINED).items() if value != ""}
     facts |= {LANGUAGE: columns[LANGUAGE][0]} if LANGUAGE in columns else {}
-    facts_again = DemonstrationRecord.of(again).determined() | {LANGUAGE: persistent_rows(columns_again)}
+    facts_again = DemonstrationRecord.of(again).model_dump() | {LANGUAGE: persistent_rows(columns_again)}
     of_episode = next(
         (Disagreement(key, None, old, facts_again[key]) for key, old in facts.items() if old != facts_again[key]), None
     )
@@ -348,34 +328,11 @@ def replay(recorded: RecordedEpisode, images: Images | None = None) -> Disagreem
         objects_column(columns): again.objects,
         **columns_again,
     }
-    return _first_difference(columns, replayed) or image_check.difference or of_episode
-
-
-class _ImageCheck:
-    """Draw some frames while an episode is replayed, and keep the first difference."""
-
-    def __init__(self, exec_start: int, length: int, images: Images | None) -> None:
-        self.difference: Disagreement | None = None
-        even = np.linspace(0, length - 1, FRAMES_DRAWN).round().astype(int).tolist()
-        self._frames = sorted({*even, min(max(exec_start, 0), length - 1)})
-        self._recorded = {} if images is None else images(self._frames)
-        height, width = next((frames.shape[1:3] for frames in self._recorded.values()), (IMAGE_SIZE, IMAGE_SIZE))
-        self.settings = RenderSettings(height=height, width=width)
-
-    def compare(self, sim: Simulation, frame: int) -> None:
-        """Compare the present images if the frame is one of those to draw."""
-        if frame not in self._frames or self.difference is not None:
-            return
-        for camera, frames in self._recorded.items():
-            drawn, recorded = sim.render(CAMERAS[camera]), frames[self._frames.index(frame)]
-            difference = _unlike(drawn, recorded)
-            if difference:
-                self.difference = Disagreement(image_key(camera), frame, difference, "the simulator's image")
-                return
+    return _first_difference(columns, replayed) or next(iter(of_images), None) or of_episode
 
 
 def _unlike(drawn: NDArray[np.uint8], recorded: NDArray[np.uint8]) -> str:
-    """Return the difference of a recorded image to a drawn one, "" if the encoding explains it."""
+    # "" if the encoding explains the difference
     if drawn.shape != recorded.shape:
         return f"an image of {recorded.shape[0]}×{recorded.shape[1]} pixels"
     off = drawn.astype(np.float32) - recorded
@@ -393,27 +350,27 @@ def resimulate(
     seed: int,
     actions: NDArray[np.float32],
     exec_start: int,
-    image_check: _ImageCheck | None = None,
     held: NDArray[np.bool_] | None = None,
+    render: RenderSettings | None = None,
+    show: Callable[[Simulation, int], None] = lambda sim, frame: None,
 ) -> Demonstration:
     """Apply (T, 7) float32 actions in the scene of ``seed``; return the resulting demonstration without images.
 
-    At the end of the prompt the scene returns to its start, except for hidden objects: at frame ``exec_start``, or at
-    the first frame of the rest before it, whose action is zeros. ``held`` (T,) are the frames after which nothing is
-    simulated.
+    ``held`` (T,) are the frames after which nothing is simulated; ``show`` is called before each step.
     """
-    sim = Simulation(task, None if image_check is None else image_check.settings)
+    sim = Simulation(task, render)
     sim.reset(seed)
     start, scene_hash, fixture_poses = sim.snapshot(), sim.scene_hash(), sim.fixture_poses()
     progress = Progress(task)
     look = ObjectSlots(sim)
-    states, proprio, satisfied = [], [], []
-    objects: list[NDArray[np.float32]] = []
-    success = False
-    rests, strict = False, task.suite == STRICT
+    frames: list[tuple[Any, ...]] = []
+    success = rests = False
+    strict = task.suite == STRICT
     for frame, action in enumerate(actions):
         rested, rests = rests, strict and frame < exec_start and not action.any()
         rests = rests or (held is not None and bool(held[frame]))
+        # The scene returns to its start, except for hidden objects, at the end of the prompt: the start of execution,
+        # or of the rest before it, whose actions are zeros.
         if 0 < frame <= exec_start and not rested and (rests or frame == exec_start):
             sim.end_prompt(start, () if task.prompt is None else task.prompt.places)
         if frame > 0 and frame == exec_start:
@@ -421,38 +378,36 @@ def resimulate(
         if frame == exec_start and strict:
             progress.settle(sim.holds)
         sim.highlights = highlights_at(task, sim, frame) if frame < exec_start else ()
-        if image_check is not None:
-            image_check.compare(sim, frame)
-        states.append(sim.state())
-        proprio.append(sim.proprio())
-        objects.append(objects[-1] if rests and rested else look.observe())
-        satisfied.append(progress.satisfied)
+        show(sim, frame)
+        seen = frames[-1][2] if rests and rested else look.observe()
+        frames.append((sim.state(), sim.proprio(), seen, progress.satisfied))
         success = success or progress.success
         if not rests:
             sim.step(action)
             if frame >= exec_start:
                 progress.step(sim.holds)
+    states, proprio, objects, satisfied = map(np.array, zip(*frames, strict=True))
     return Demonstration(
         task=task,
         seed=seed,
         referent="fixed",
         variant=task.variant_index,
-        states=np.array(states),
+        states=states,
         actions=np.asarray(actions, dtype=np.float32),
-        proprio=np.array(proprio, dtype=np.float32),
+        proprio=proprio.astype(np.float32),
         images=None,
         exec_start=exec_start,
-        satisfied=np.array(satisfied, dtype=np.bool_).reshape(len(states), len(task.checkpoints)),
+        satisfied=satisfied.astype(np.bool_),
         success=success,
         fixture_poses=fixture_poses,
         scene_hash=scene_hash,
-        objects=np.array(objects),
+        objects=objects,
         held=held,
     )
 
 
 def _first_difference(recorded: Columns, replayed: Columns) -> Disagreement | None:
-    """Return the first difference of a common column by frame, then by order of the columns."""
+    # By frame, then by order of the columns.
     first: Disagreement | None = None
     for column, new in replayed.items():
         if column not in recorded:

@@ -47,10 +47,7 @@ def _encoder() -> RGBEncoderConfig:
 
 
 class VideoWriter:
-    """Encode a video of ``rate`` frames/s frame by frame, so that an episode's images are never in memory together.
-
-    It uses one thread, so that the bytes do not depend on the machine's cores or on other processes.
-    """
+    """Encode a video of ``rate`` frames/s frame by frame, so that an episode's images are never in memory together."""
 
     def __init__(self, path: Path, rate: int = CONTROL_HZ) -> None:
         self._path, self._rate = path, rate
@@ -63,6 +60,7 @@ class VideoWriter:
 
         if self._container is None:
             encoder = _encoder()
+            # With one thread the bytes do not depend on the machine's cores or on other processes.
             options = encoder.get_codec_options(1, as_strings=True)
             self._container = av.open(str(self._path), "w")
             self._stream = self._container.add_stream(encoder.vcodec, self._rate, options=options)
@@ -71,17 +69,13 @@ class VideoWriter:
         image = av.VideoFrame.from_ndarray(frame, format="rgb24")
         self._container.mux(self._stream.encode(image))
 
-    def close(self) -> None:
-        """Flush the encoder and end the file."""
+    def close(self, flush: bool = True) -> None:
+        """Flush the encoder and end the file; without ``flush`` the file is unusable."""
         if self._container is not None:
-            self._container.mux(self._stream.encode())
+            if flush:
+                self._container.mux(self._stream.encode())
             self._container.close()
             self._container = None
-
-    def abandon(self) -> None:
-        """Close the unfinished file, which will be deleted."""
-        if self._container is not None:
-            self._container.close()
 
 
 def mirror_video(source: Path, path: Path, rate: int) -> None:
@@ -96,10 +90,7 @@ def mirror_video(source: Path, path: Path, rate: int) -> None:
 
 
 def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
-    """Join videos of one encoder, given with their numbers of frames, without encoding them again.
-
-    Frame i of the result is at exactly i / 20 s: times follow from frame counts, not from the durations in the files.
-    """
+    """Join videos of one encoder, given with their numbers of frames, without encoding them again."""
     import av
 
     with av.open(str(path), "w", options={"movflags": "faststart"}) as target:
@@ -112,12 +103,6 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
                 if stream is None:
                     stream = target.add_stream_from_template(template, opaque=True)
                     stream.time_base = time_base = template.time_base
-                    extradata = template.codec_context.extradata
-                if (template.time_base, template.codec_context.extradata) != (time_base, extradata):
-                    raise MemobenchError(
-                        f"{part} and {videos[0][0]} were encoded with different settings; delete both folders and "
-                        "generate again"
-                    )
                 for packet in source.demux(template):
                     if packet.dts is None or packet.pts is None:
                         continue  # the demuxer's last, empty packet
@@ -125,7 +110,7 @@ def join_videos(videos: Sequence[tuple[Path, int]], path: Path) -> None:
                     packet.dts += offset
                     packet.stream = stream
                     target.mux(packet)
-            offset += round(frames / (CONTROL_HZ * time_base))
+            offset += round(frames / (CONTROL_HZ * time_base))  # the files' own durations are not exactly i / 20 s
 
 
 def video_info(path: Path) -> dict[str, Any]:
@@ -145,11 +130,10 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 
 
 class ImageHistograms:
-    """Collect a histogram of 256 bins per channel of each frame, for statistics of an episode.
+    """Collect a histogram of 256 bins per channel of each frame, for statistics of an episode."""
 
-    LeRobot samples frames evenly over the episode, at least 100, so the sample is known only at its end. The histograms
-    of a frame take 3 kB, the frame itself 192 kB.
-    """
+    # LeRobot samples frames evenly over the episode, so the sample is known only at its end. The histograms of a frame
+    # take 3 kB, the frame itself 192 kB.
 
     def __init__(self) -> None:
         self._counts: list[NDArray[np.int32]] = []
@@ -162,10 +146,9 @@ class ImageHistograms:
         self._counts.append(np.array(counts, dtype=np.int32))
 
     def stats(self, *, sampled: bool = False) -> Stats:
-        """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,).
+        """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,), exact over the pixels.
 
-        They are over LeRobot's sample of the added frames (``sampled``: these are the sample), but exact over its
-        pixels: values of eight bits need 256 bins.
+        They are of LeRobot's sample of the added frames; ``sampled``: the added frames are the sample.
         """
         from lerobot.datasets.compute_stats import sample_indices
 
@@ -185,8 +168,7 @@ class ImageHistograms:
         return {name: value.reshape(3, 1, 1) for name, value in stats.items()} | {"count": np.array([len(chosen)])}
 
 
-TOLERANCE = 1e-4
-"""Largest difference of a decoded frame to its time, s."""
+TOLERANCE = 1e-4  # largest difference of a decoded frame to its time, s
 FrameReader = Callable[[int, list[int]], Any]
 """From (episode, frame numbers) to images (n, 3, H, W) float32 in [0, 1], or to another input of an encoder."""
 
@@ -207,10 +189,8 @@ def frame_reader(root: Path, camera: str) -> FrameReader:
             f"The dataset {root} has no camera '{camera}'; it has {', '.join(meta.camera_keys)}. "
             "Choose one with --policy.memory_camera."
         )
-    return (_video_reader if camera in meta.video_keys else _image_reader)(root, camera, meta)
-
-
-def _video_reader(root: Path, camera: str, meta: LeRobotDatasetMetadata) -> FrameReader:
+    if camera not in meta.video_keys:
+        return _image_reader(root, camera, meta)
     height, width, channels = meta.features[camera]["shape"]
     decode = _decoder()
     lock = threading.Lock()

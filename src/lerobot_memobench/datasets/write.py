@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +25,6 @@ from numpy.typing import NDArray
 from lerobot_memobench.constants import CLOCK, CONTROL_HZ
 from lerobot_memobench.datasets.card import write_card
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, Demonstration
-from lerobot_memobench.datasets.episodes import ListedEpisode
 from lerobot_memobench.datasets.layout import (
     DEFAULT_REPO_ID,
     EPISODE_INFO,
@@ -42,13 +42,11 @@ from lerobot_memobench.datasets.stage import (
     TEMPORARY,
     StagedEpisode,
     check_destination,
-    flush_to_disk,
     stage_demonstration,
 )
 from lerobot_memobench.datasets.video import QUANTILES, Stats, join_videos, video_info
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import file_hash, files_below, write_file
-from lerobot_memobench.jobs.processes import locked
+from lerobot_memobench.io import file_hash, files_below, flush_to_disk, write_file
 from lerobot_memobench.sim.convention import UPRIGHT
 
 if TYPE_CHECKING:
@@ -58,8 +56,7 @@ if TYPE_CHECKING:
 ROBOT_TYPE = "panda"
 STATES_PATH = "states/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PER_STATES_FILE = 100
-BLOCK = 16
-"""Columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes."""
+BLOCK = 16  # columns per pass of statistics: a float64 copy of all columns of thousands of episodes takes gigabytes
 
 
 def write_dataset(
@@ -67,29 +64,21 @@ def write_dataset(
     out: Path | str,
     *,
     repo_id: str = DEFAULT_REPO_ID,
-    made_by: str = "",
     convention: str = UPRIGHT,
 ) -> Path:
     """Write demonstrations, in their order, as a dataset in ``out`` (absent or empty); one is in memory at a time.
 
-    Either all of them have images or none. ``made_by`` is a sentence for the card, ``convention`` that of the images.
+    Either all of them have images or none; ``convention`` is that of the images.
     """
     out = Path(out)
     check_destination(out)
-    staging = out / STAGING
-    episodes = staging / "episodes"
-    staging.mkdir(parents=True, exist_ok=True)
-    with locked(staging, out):
-        try:
-            shutil.rmtree(episodes, ignore_errors=True)
-            staged = [
-                stage_demonstration(demo, episodes / f"{k:06d}", convention) for k, demo in enumerate(demonstrations)
-            ]
-            return assemble(staged, out, repo_id=repo_id, made_by=made_by)
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-            if out.is_dir() and not any(out.iterdir()):
-                out.rmdir()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent) as staging:
+        numbered = enumerate(demonstrations)
+        staged = [stage_demonstration(demo, Path(staging) / f"{k:06d}", convention) for k, demo in numbered]
+        assemble(staged, out, repo_id=repo_id)
+    shutil.rmtree(out / STAGING)
+    return out
 
 
 def assemble(
@@ -105,15 +94,11 @@ def assemble(
 
     Deterministic: equal episodes give equal files.
 
-    Args:
-        made_by: sentence for the card.
-        manifest: further content of manifest.json.
-        left_out: reasons for the card why further episodes are missing.
+    ``made_by`` is a sentence for the card, ``left_out`` its reasons why further episodes are missing; ``manifest`` is
+    further content of manifest.json.
     """
     out = Path(out)
     written = [episode for episode in episodes if episode.failure is None]
-    if not written:
-        raise MemobenchError(f"there is no successful demonstration to write to {out}; see the failures reported")
     if len({tuple(episode.image_stats) for episode in written}) > 1:
         raise MemobenchError(
             f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
@@ -124,61 +109,51 @@ def assemble(
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     versions = (manifest or {}).get("request", {}).get("versions")
-    features, listed = _write_lerobot(written, build, repo_id, versions)  # makes the folder
-    _write_manifest(episodes, listed, manifest or {}, build)
+    features = _write_lerobot(written, build, repo_id, versions)  # makes the folder
+    _write_manifest(episodes, manifest or {}, build)
     failed = [episode for episode in episodes if episode.failure is not None]
-    write_card(build, listed, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
+    described = [(episode.record(), episode.length) for episode in written]
+    write_card(build, described, failed, features, repo_id=repo_id, made_by=made_by, left_out=left_out)
     _move(build, out)
     return out
 
 
 def _write_lerobot(
     written: Sequence[StagedEpisode], build: Path, repo_id: str, versions: dict[str, str] | None
-) -> tuple[dict[str, dict[str, Any]], list[ListedEpisode]]:
-    """Write the LeRobotDataset of the episodes into ``build``; return its features and its list of episodes."""
+) -> dict[str, dict[str, Any]]:
     from lerobot.datasets.compute_stats import aggregate_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.io_utils import write_stats
 
-    cameras = written[0].image_stats
+    cameras, image_size = written[0].image_stats, None
+    if cameras:
+        video = video_info(written[0].video(next(iter(cameras))))
+        image_size = (video["video.height"], video["video.width"])
     meta = LeRobotDatasetMetadata.create(
         repo_id=repo_id,
         fps=CONTROL_HZ,
-        features=dataset_features(_image_size(written[0]), cameras),
+        features=dataset_features(image_size, cameras),
         root=build,
         robot_type=ROBOT_TYPE,
         use_videos=bool(cameras),
         metadata_buffer_size=len(written) + 1,  # one table: types of its columns come from all episodes
     )
-    numbers, listed = _write_frames(meta, written, versions)
+    numbers = _write_frames(meta, written, versions)
     of_images = aggregate_stats([episode.camera_stats() for episode in written]) if cameras else {}
     # LeRobot's come in the order of a set, another one in each process.
     meta.stats = numbers | {key: of_images[key] for key in map(image_key, cameras)}
     write_stats(meta.stats, meta.root)
     meta.finalize()
-    return dict(meta.features), listed
+    return dict(meta.features)
 
 
-def _image_size(episode: StagedEpisode) -> tuple[int, int] | None:
-    import av
-
-    for camera in episode.image_stats:
-        with av.open(str(episode.video(camera))) as container:
-            stream = container.streams.video[0]
-            return stream.height, stream.width
-    return None
-
-
-def _write_manifest(
-    episodes: Sequence[StagedEpisode], listed: Sequence[ListedEpisode], extra: dict[str, Any], build: Path
-) -> None:
-    """Write the hashes of all files and requested episodes; failed ones have a reason instead of an index."""
+def _write_manifest(episodes: Sequence[StagedEpisode], extra: dict[str, Any], build: Path) -> None:
     keys = ("task_name", "seed", "referent", "variant", "success", "frames", "scene_hash", "digest")
-    rows, indices = [], iter(listed)
+    rows, indices = [], iter(range(len(episodes)))
     for episode in episodes:
         row = {key: episode.info.get(key) for key in keys}
         row |= {key: episode.info[key] for key in ("world", "stand_ins") if key in episode.info}
-        index = next(indices).index if episode.failure is None else None
+        index = next(indices) if episode.failure is None else None
         rows.append(row | {"episode_index": index, "failure": episode.failure})
     files = {
         name: {"bytes": (build / name).stat().st_size, "sha256": file_hash(build / name)}
@@ -188,16 +163,15 @@ def _write_manifest(
 
 
 def _move(build: Path, out: Path) -> None:
-    """Move the finished build into ``out``, which becomes a dataset with the last move."""
     out.mkdir(parents=True, exist_ok=True)
-    flush_to_disk(files_below(build))  # `meta` must not arrive before the files that it names
+    flush_to_disk(*files_below(build))  # `meta` must not arrive before the files that it names
     for name in TOP_LEVEL:
         target = out / name
         if target.is_dir():
             shutil.rmtree(target)  # of an interrupted move: `meta` is not there yet
         if (build / name).exists():
-            os.replace(build / name, target)
-    flush_to_disk([out])
+            os.replace(build / name, target)  # `meta` last: with it the folder is a dataset
+    flush_to_disk(out)
     build.rmdir()
 
 
@@ -206,14 +180,10 @@ def _move(build: Path, out: Path) -> None:
 
 def _write_frames(
     meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode], versions: dict[str, str] | None
-) -> tuple[dict[str, Stats], list[ListedEpisode]]:
-    """Write data/, states/, videos/ and the metadata; return exact statistics of numbers, and the episodes' places.
-
-    Each episode is one row group, in files of LeRobot's size.
-    """
+) -> dict[str, Stats]:
+    """Write data/, states/, videos/ and meta/; return exact statistics of numbers."""
     data, states = ParquetFiles(meta.root, meta.data_path), ParquetFiles(meta.root, STATES_PATH)
     numbers: dict[str, list[NDArray]] = {}
-    listed: list[ListedEpisode] = []
     start = 0
     for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
         if data.size() >= meta.data_files_size_in_mb * 1024**2:
@@ -231,7 +201,7 @@ def _write_frames(
             "task_index": np.full(length, meta.get_task_index(task)),
         }
         info = np.full(length, "", dtype=object)
-        info[0] = record.in_frames()
+        info[0] = record.model_dump_json(exclude_none=True)
         columns = {
             "observation.state": arrays["proprio"],
             "action": arrays["actions"],
@@ -257,11 +227,10 @@ def _write_frames(
             "dataset_to_index": start + length,
         }
         meta.save_episode(number, length, [task], stats, files | videos | record.in_meta())
-        listed.append(ListedEpisode(number, start, length, record))
         start += length
     data.close()
     states.close()
-    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}, listed
+    return {key: numeric_stats(np.concatenate(values)) for key, values in numbers.items()}
 
 
 def numeric_stats(values: NDArray) -> Stats:
@@ -284,7 +253,6 @@ def numeric_stats(values: NDArray) -> Stats:
 
 
 def _frames_table(columns: dict[str, NDArray], episode: StagedEpisode, features: dict[str, Any]) -> pa.Table:
-    """Return an episode's columns and language rows as a table of the type that LeRobot reads."""
     import pyarrow as pa
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
@@ -305,9 +273,9 @@ def _array(values: NDArray, kind: pa.DataType) -> pa.Array:
 
 
 def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
-    """Return the episode's rows, equal at every frame: built once and repeated by index."""
     import datasets
 
+    # The rows are equal at every frame: built once and repeated by index.
     once = datasets.Dataset.from_dict(
         {LANGUAGE: [episode.language_persistent]}, features=datasets.Features({LANGUAGE: feature})
     ).with_format("arrow")[:]
@@ -317,15 +285,8 @@ def _language(episode: StagedEpisode, feature: Any) -> pa.Array:
 def _states_table(states: NDArray[np.float64], number: int) -> pa.Table:
     import pyarrow as pa
 
-    length, width = states.shape
-    offsets = pa.array(np.arange(0, (length + 1) * width, width, dtype=np.int32))
-    return pa.table(
-        {
-            "episode_index": pa.array(np.full(length, number)),
-            "frame_index": pa.array(np.arange(length)),
-            "state": pa.ListArray.from_arrays(offsets, pa.array(states.ravel())),
-        }
-    )
+    numbers = {"episode_index": np.full(len(states), number), "frame_index": np.arange(len(states))}
+    return pa.table(numbers | {"state": pa.array(list(states))})
 
 
 class ParquetFiles:
@@ -349,7 +310,7 @@ class ParquetFiles:
 
     def size(self) -> int:
         """Return the bytes of the current file."""
-        return self._path.stat().st_size if self._writer is not None and self._path is not None else 0
+        return self._path.stat().st_size if self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:
         """Begin the next file."""
@@ -362,14 +323,14 @@ class ParquetFiles:
         """End the current file."""
         if self._writer is not None:
             self._writer.close()
-            self._writer = None
+            self._writer = self._path = None
 
 
 # --- videos ---
 
 
 def _write_videos(meta: LeRobotDatasetMetadata, episodes: Sequence[StagedEpisode]) -> list[dict[str, Any]]:
-    """Join the episodes' videos below the dataset's root; return each episode's columns of meta/episodes."""
+    # Joins the episodes' videos; returns each episode's columns of meta/episodes.
     from lerobot.datasets.io_utils import write_info
     from lerobot.datasets.utils import update_chunk_file_indices
 

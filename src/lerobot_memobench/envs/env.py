@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +15,9 @@ import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from lerobot_memobench.constants import (
-    ACTION_DIM,
-    EXECUTION,
-    PROMPT,
-    PROMPT_HORIZON,
-    SEALED,
-    SPLITS,
-    UNSEEDED,
-)
+from lerobot_memobench.constants import ACTION_DIM, EXECUTION, PROMPT, PROMPT_HORIZON, SEALED, SPLITS, UNSEEDED
 from lerobot_memobench.envs.episode import Episode, generator
-from lerobot_memobench.envs.episode_log import (
-    EpisodeLog,
-    episode_record,
-    has_log,
-    not_run_record,
-    read_lines,
-)
+from lerobot_memobench.envs.episode_log import EpisodeLog, episode_record, has_log, not_run_record, read_lines
 from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, facts_of
 from lerobot_memobench.envs.observations import (
     METADATA,
@@ -47,8 +33,8 @@ from lerobot_memobench.envs.settings import AUTO, DEFAULTS, EVERY, RESET, STEPS,
 from lerobot_memobench.envs.video import BAND, VideoRecorder
 from lerobot_memobench.errors import MemobenchError, check_choice
 from lerobot_memobench.io import file_name
+from lerobot_memobench.tasks.assessment import scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task, load_task, suite_of, task_names
-from lerobot_memobench.tasks.evidence import scene_and_variant
 from lerobot_memobench.tasks.memory_text import memory_text, with_memory
 from lerobot_memobench.tasks.task import Task
 
@@ -70,18 +56,15 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     An invalid action, unstable physics, and a task that the simulator or the expert cannot run raise a
     `MemobenchError`. If episodes are logged, such an episode is truncated instead; its reason is in the log and in the
-    info as ``fault``.
-
-    A pickled copy keeps the settings and starts with `reset`.
+    info as ``fault``. A pickled copy keeps the settings and starts with `reset`.
 
     Args:
         task: name in the catalogue of either suite, or a task folder.
-        settings: ``suite`` follows from the task, and ``prompt_in=auto`` means `STEPS`.
+        settings: ``suite`` follows from the task; ``prompt_in=auto`` means `STEPS`. ``changes`` replace some by name.
         log_dir: folder of the episode log; None for no log.
         acting: description of the policy; episodes of other seeds than the requested ones are not logged or recorded.
         reward: `sparse`: 1 at success. `checkpoints`: 1 / (K + 1) for each of the K memory checkpoints completed in
             order, and 1 / (K + 1) at success, so the sum is at most 1 and reaches 1 only with success.
-        changes: settings by name that replace those of ``settings``, such as ``obs_type``.
     """
 
     metadata = METADATA
@@ -102,8 +85,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         settings = settings.changed(**{**changes, "suite": self._task.suite})
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS)
-        self.settings = settings
-        self.render_mode = render_mode
+        self.settings, self.render_mode = settings, render_mode
         self._task = self._task.at(settings.difficulty)
         self.task = self._task.name
         if settings.needs_prompt and self._task.prompt is None:
@@ -130,7 +112,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._warned: set[str] = set()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state of a copy: everything except the running episode, with its scene and generators."""
+        # everything except the running episode, with its scene and generators
         return {**vars(self), "_episode": None, "_others": None, "_video": None, "_began": False}
 
     @property
@@ -148,13 +130,12 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     @property
     def _max_episode_steps(self) -> int:
         """Upper bound of steps for LeRobot's loop: the horizon with pauses, holds and prompt."""
-        task = self._task
-        if self.settings.prompt_in == RESET:
+        task, settings = self._task, self.settings
+        if settings.prompt_in == RESET:
             return self._longest
-        prompt = self.settings.demonstration_prompt and task.prompt is not None
+        shown = (1 + settings.reshow) * (settings.demonstration_prompt and task.prompt is not None)
         longest_prompt = PROMPT_HORIZON if task.prompt_steps is None else task.prompt_steps
-        prompts = longest_prompt * (1 + self.settings.reshow) if prompt else 0
-        return self._longest + prompts + self.settings.longest_interference
+        return self._longest + shown * longest_prompt + settings.longest_interference
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -194,8 +175,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return self._observation(), self._info()
 
     def _play_prompt(self) -> None:
-        """Play the prompt to its end; render it for a video only."""
-        self._observer.needed = False
+        self._observer.needed = False  # it is rendered for a video only
         if self._video is None:
             self.episode.skip_prompt_frames()
         while self.episode.phase == PROMPT:
@@ -207,11 +187,8 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         """Advance by one control step of 50 ms.
 
         An episode terminates at success, when the goal of a strict task becomes unreachable, and in the authors'
-        evaluation when all checkpoints have held. The horizon truncates it.
-
-        Raises:
-            gymnasium.error.ResetNeeded, gymnasium.error.ClosedEnvironmentError: no episode is running.
-            MemobenchError: see the class; also at each later step until the next reset.
+        evaluation when all checkpoints have held. The horizon truncates it. A `MemobenchError` (see the class) is
+        raised again at each step until the next reset.
         """
         self._check_began("step")
         if self._log is None and self._not_run is None and (fault := self.episode.fault) is not None:
@@ -307,7 +284,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _observation(self) -> dict[str, Any]:
         if self._not_run is not None:
             return blank(self.observation_space)
-        episode = self.episode
+        episode, offered = self.episode, ("expert_action", "blind_action")
         observation: dict[str, Any] = {
             **self._observer.observation(),
             "agent_pos": self._shown.sim.proprio(),
@@ -316,22 +293,15 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
         if self.settings.robot_state:
             observation["robot_state"] = self._shown.sim.robot_state()
-        if self.settings.expert_action:
-            observation["expert_action"] = self._offered(episode.expert_action)
-        if self.settings.blind_action:
-            observation["blind_action"] = self._offered(episode.blind_action)
+        for name in [name for name in offered if getattr(self.settings, name)]:
+            observation[name] = np.zeros(ACTION_DIM, np.float32)  # it stays if the expert cannot do the task
+            with self._ending_episode():
+                observation[name] = getattr(episode, name)()
         return observation
-
-    def _offered(self, action: Callable[[], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return the action, zeros if the expert cannot do the task."""
-        offered: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
-        with self._ending_episode():
-            offered = action()
-        return offered
 
     def _info(self) -> dict[str, Any]:
         if self._not_run is not None:
-            return {"is_success": False, "phase": EXECUTION, "checkpoints_completed": 0, "fault": self._not_run}
+            return {**_info_without_scene(False), "fault": self._not_run}
         episode = self.episode
         return {
             "is_success": episode.success,
@@ -342,7 +312,7 @@ class MemobenchEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def render(self) -> NDArray[np.uint8]:
-        """Return both cameras side by side, under instruction and checkpoints; see `Observer.frame`."""
+        """Return both cameras side by side, under instruction and checkpoints."""
         self._check_began("render")
         return self._observer.frame(self._shown) if self._not_run is None else _black(self.settings)
 
@@ -376,78 +346,71 @@ class Interference:
         self.shown: Episode | None = None
 
     def begin(self, seed: int) -> None:
-        """Draw the scenes of an episode, outside all splits."""
-        self._seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
-        self._done = 0
+        """Begin with the episodes that follow the prompt of a seed's episode."""
+        self._frames = self._play(seed)
         self.shown = None
 
     def step(self, main: Episode) -> bool:
         """Advance the shown episode by one control step; False if ``main`` itself has to advance."""
         if not main.waits:
             return False
-        if self.shown is None:
-            self._open()
-        elif self.shown.done or self.shown.expert_done:
-            self._done += 1
-            if self._done == len(self._names):
-                self.shown = None
-                main.wait(last=True)
-                return True
-            self._open()
-        else:
-            other = self.shown
-            other.step(np.zeros(ACTION_DIM, np.float32) if other.phase == PROMPT else other.expert_action())
-        main.wait()
+        self.shown = next(self._frames, None)
+        main.wait(last=self.shown is None)
         return True
 
-    def _open(self) -> None:
-        name = self._names[self._done]
-        if name not in self._episodes:
-            self._episodes[name] = Episode(get_task(name), self._settings)
-        self.shown = self._episodes[name]
-        self.shown.reset(int(self._seeds[self._done]))
+    def _play(self, seed: int) -> Iterator[Episode]:
+        # Scenes outside all splits.
+        seeds = generator(self._task, seed, 6).integers(*UNSEEDED, size=len(self._names))
+        for name, own_seed in zip(self._names, seeds.tolist(), strict=True):
+            if name not in self._episodes:
+                self._episodes[name] = Episode(get_task(name), self._settings)
+            shown = self._episodes[name]
+            shown.reset(own_seed)
+            yield shown
+            while not (shown.done or shown.expert_done):
+                shown.step(np.zeros(ACTION_DIM, np.float32) if shown.phase == PROMPT else shown.expert_action())
+                yield shown
 
 
 class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     """End logged episodes at their first step with the logged outcome, without simulation.
 
     Batch size and rows stay the same, so the policy acts in the other rows as in an uninterrupted evaluation.
-    Observations of a skipped episode are blank. The log is read once, at the first reset.
+    Observations of a skipped episode are blank.
     """
 
     def __init__(self, make: Callable[[], gym.Env[Any, Any]], log_dir: Path, settings: EnvSettings) -> None:
         super().__init__(make())
         self._log_dir, self._settings = log_dir, settings
-        self._logged: dict[int, dict[str, Any]] | None = None
-        self._skipped: dict[str, Any] | None = None
+        self._skipped: bool | None = None
+
+    @cached_property
+    def _successes(self) -> dict[int, bool]:
+        # Read at the first reset: each process of a vector environment opens its own.
+        lines, name = read_lines(self._log_dir) if has_log(self._log_dir) else [], self.get_wrapper_attr("task")
+        return {line["episode"]: line["success"] for line in lines if line["task"] == name}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start the episode of a seed, or skip it."""
-        self._skipped = None if seed is None else self._records().get(seed - self._settings.seed_base)
+        self._skipped = None if seed is None else self._successes.get(seed - self._settings.seed_base)
         if self._skipped is None:
             return self.env.reset(seed=seed, options=options)
-        return blank(self.observation_space), self._info(False)
+        return blank(self.observation_space), _info_without_scene(False)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Advance, or end with the logged outcome."""
-        if self._skipped is None:
+        success = self._skipped
+        if success is None:
             return self.env.step(action)
-        success = self._skipped["success"]
-        return blank(self.observation_space), float(success), success, not success, self._info(success)
+        return blank(self.observation_space), float(success), success, not success, _info_without_scene(success)
 
     def render(self) -> Any:
         """Return the environment's image; black for a skipped episode."""
         return self.env.render() if self._skipped is None else _black(self._settings)
 
-    def _info(self, success: bool) -> dict[str, Any]:
-        return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
-    def _records(self) -> dict[int, dict[str, Any]]:
-        if self._logged is None:
-            lines = read_lines(self._log_dir) if has_log(self._log_dir) else []
-            name = self.get_wrapper_attr("task")
-            self._logged = {line["episode"]: line for line in lines if line["task"] == name}
-        return self._logged
+def _info_without_scene(success: bool) -> dict[str, Any]:
+    return {"is_success": success, "phase": EXECUTION, "checkpoints_completed": 0}
 
 
 def _black(settings: EnvSettings) -> NDArray[np.uint8]:
@@ -456,7 +419,6 @@ def _black(settings: EnvSettings) -> NDArray[np.uint8]:
 
 @cache
 def _warn_of_sealed_seeds() -> None:
-    """Log once per process that a sealed scene is used outside of the sealed test."""
     seeds = SPLITS[SEALED]
     logger.warning(
         "seeds %d to %d are sealed: run them once per release, by `memobench test-sealed`", seeds[0], seeds[-1]

@@ -33,8 +33,7 @@ from lerobot_memobench.constants import (
 from lerobot_memobench.envs.pacing import Pacing
 from lerobot_memobench.envs.prompts import PromptPlayer, prompt_file, prompt_player
 from lerobot_memobench.envs.settings import DEFAULTS, INTACT, EnvSettings, steps_per_action
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
-from lerobot_memobench.experts.expert import Expert, blind_routine
+from lerobot_memobench.experts.expert import Expert, PromptDemonstrator, blind_routine
 from lerobot_memobench.sim.object_slots import ObjectSlots
 from lerobot_memobench.sim.simulation import (
     InvalidActionError,
@@ -43,11 +42,9 @@ from lerobot_memobench.sim.simulation import (
     UnstablePhysicsError,
     as_action,
 )
-from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.evidence import Choice
-from lerobot_memobench.tasks.failures import INVALID_ACTION, UNSTABLE_PHYSICS
+from lerobot_memobench.tasks.assessment import INVALID_ACTION, UNSTABLE_PHYSICS, Choice
+from lerobot_memobench.tasks.catalogue import get_task, initial_states
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.libero_suites import initial_states
 from lerobot_memobench.tasks.memory_text import subtask_texts
 from lerobot_memobench.tasks.progress import AS_BEGUN, Progress
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT, Task, referent_text
@@ -55,7 +52,7 @@ from mujoco_raster.drawlist import Image
 
 
 class Fault(NamedTuple):
-    """Reason of an aborted execution: one of `tasks.failures.FAULTS`, and a sentence."""
+    """Reason of an aborted execution: one of `tasks.assessment.FAULTS`, and a sentence."""
 
     failure: str
     why: str
@@ -64,9 +61,7 @@ class Fault(NamedTuple):
 class Episode:
     """An episode of one task; `reset` starts it for a seed.
 
-    Args:
-        render: size and quality of frames; None for those of ``settings``.
-        changes: settings by name that replace those of ``settings``.
+    ``render``: size and quality of frames, None for those of ``settings``. ``changes`` replace settings by name.
 
     Attributes:
         task: the task of this episode: a variant if the referent is drawn.
@@ -77,8 +72,7 @@ class Episode:
         rested: whether the last step was part of a pause or a hold: the scene was at rest and only the clock advanced.
         fault: reason of an aborted execution, or None.
         waits: whether other episodes are shown between prompt and execution.
-        corrupts: whether the policy's memory is corrupted before the policy observes this frame. corrupted: whether it
-            has been.
+        corrupts: whether the memory is corrupted before the policy observes this frame. corrupted: whether it has been.
         choice: the variant that the policy acts on; None outside evidence episodes.
     """
 
@@ -102,9 +96,7 @@ class Episode:
     def reset(self, seed: int, variant: int | None = None, *, keep_prompt: bool = False) -> None:
         """Start the episode of a seed. The episode is a function of task, settings, seed and actions.
 
-        Args:
-            variant: variant to run instead of the drawn one (evidence); `choice` then follows the policy's choice.
-            keep_prompt: whether the prompt is cached (`prompts`).
+        ``variant`` replaces the drawn one (evidence), and `choice` follows the policy's. ``keep_prompt``: cache it.
         """
         self.seed = int(seed)
         self.fault: Fault | None = None
@@ -155,8 +147,8 @@ class Episode:
         self._begin_if_due()
 
     def draw_holds(self) -> Iterator[int]:
-        """Return the lengths of the episode's holds, which do not depend on the variant."""
-        rng = generator(self.published, self.seed, 5, self.settings.salt)
+        """Return the lengths of the episode's holds."""
+        rng = generator(self.published, self.seed, 5, self.settings.salt)  # not of the variant
         drawn = rng.gamma(HOLD_SHAPE, HOLD_MEAN / HOLD_SHAPE, MOST_HOLDS)
         if self.published.prompt is None:
             # By the law of the others a policy with a clock would count to one in 80 % (docs/benchmark/suites.md).
@@ -174,10 +166,9 @@ class Episode:
             self._prompt.observed = False
 
     def _step_prompt(self) -> None:
-        """Play the next step of the prompt; after its end the scene rests until the execution begins."""
         self.applied_action = np.zeros(ACTION_DIM, np.float32) if self._prompt is None else self._prompt.step()
         self.step_index += 1
-        if self._prompt is None or not self._prompt.over:
+        if self._prompt is None or not self._prompt.over:  # after its end the scene rests until the execution begins
             return
         self.prompt_shown = self._prompt.succeeded
         if self._reshows:
@@ -297,21 +288,15 @@ class Episode:
         if self.rested:
             return
         self.progress.step(self.sim.holds)
-        self._hold_after_event()
+        self._event = self._event or self.progress.event
+        # Returns without an event are not held: a policy with a clock could use them to time its next event.
+        if self._event and self.sim.caught_at_home and self.sim.holds(AS_BEGUN):
+            self.pacing.hold(next(self._holds, 0))
+            self._event = False
         self._corrupt_at(self.exec_steps)
         if self.choice is not None:
             self.choice.step(self.sim.holds)
         self.drifted = self.drifted or any(self.sim.holds(atom) for atom in self._wrong_atoms)
-
-    def _hold_after_event(self) -> None:
-        """Begin a hold when the scene is as it began, with the hand at home, and a strict task's event has passed.
-
-        Other returns are not held: a policy with a clock could use them to choose the time of its next event.
-        """
-        self._event = self._event or self.progress.event
-        if self._event and self.sim.caught_at_home and self.sim.holds(AS_BEGUN):
-            self.pacing.hold(next(self._holds, 0))
-            self._event = False
 
     def _act(self, action: ArrayLike) -> Fault | None:
         try:
@@ -388,11 +373,7 @@ def generator(task: Task, seed: int, stream: int, salt: str | None = None) -> np
 
 
 def _wrong_atoms(task: Task) -> Iterator[Atom]:
-    """Yield atoms that hold after a wrong answer in object and procedural tasks.
-
-    These are a checkpoint's atoms with another instance of the same class as object or target, and the atoms of other
-    variants. Atoms of this task's own checkpoints are excluded.
-    """
+    # Atoms after a wrong answer: a checkpoint's with another instance of the same class, and those of other variants.
     if task.memory_type not in ("object", "procedural"):
         return
     own = list(dict.fromkeys(atom for checkpoint in task.checkpoints for atom in atoms(checkpoint.goal)))

@@ -20,9 +20,8 @@ from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, EXTENT, POLI
 from lerobot_memobench.envs.settings import INTACT, steps_per_action
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.io import file_name, write_file
+from lerobot_memobench.tasks.assessment import chance, classify_failure
 from lerobot_memobench.tasks.catalogue import group_of, suite_of
-from lerobot_memobench.tasks.evidence import chance
-from lerobot_memobench.tasks.failures import classify_failure
 from lerobot_memobench.tasks.task import REFERENTS, STRICT, Task
 from lerobot_memobench.untrusted import Count, Malformed, Name, Number, Whole, checked, file_bytes, packed, parsed
 
@@ -43,79 +42,47 @@ Key = tuple[str, int]
 
 
 class CheckpointRecord(TypedDict):
-    """A memory checkpoint of a rollout. Execution steps count from 1; None if the predicate never held.
+    """A memory checkpoint of a rollout. Execution steps count from 1; None if the predicate never held."""
 
-    Attributes:
-        operation: Storage, Update or Compression.
-        first_step: first execution step at which it held.
-        ordered_step: first execution step at which it held with all earlier checkpoints complete.
-    """
-
-    operation: Literal["S", "U", "C"]
-    first_step: Count | None
+    operation: Literal["S", "U", "C"]  # Storage, Update or Compression
+    first_step: Count | None  # first execution step at which it held
+    # first execution step at which it held with all earlier checkpoints complete
     ordered_step: NotRequired[Count | None]
 
 
 class EpisodeRecord(TypedDict):
-    """A line of the log.
-
-    Attributes:
-        task: name in the catalogue.
-        memory_type: temporal, spatial, object or procedural; the suite of a task of LIBERO.
-        episode: number of the episode in its evaluation, from 0.
-        seed: seed of the scene: seed base + episode, except in evidence episodes.
-        variant: index of the task's variant; 0 is the published one.
-        prompt_steps: control steps before the execution.
-        prompt_shown: whether the demonstration prompt succeeded; None without a prompt.
-        steps: execution steps.
-        paused_steps: control steps of pauses; only with pauses.
-        held_steps: control steps of holds; strict tasks only.
-        corrupted: whether the memory was corrupted before the episode ended; only with corruption.
-        success: whether the goal held at the end.
-        choice: evidence episodes: variant that the policy acted on; None for no variant.
-        answered: evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant.
-        variants: evidence episodes: number of variants of the task.
-        chance: evidence episodes: rate of correct choices without memory; None if the instruction names the variant.
-        checkpoints: memory checkpoints in the task's order.
-        failure: failure class; None for a success.
-        fault: reason why the episode was aborted: an invalid action or unstable physics.
-        lost: strict tasks: whether the goal became unreachable.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        scene_hash: hash of the initial scene.
-        settled: false if an object was thrown, or still moved, when the scene began; absent otherwise.
-        wall_s: duration of the episode, s.
-        not_run: reason why the episode could not be run. Such a line is no rollout and enters no rate.
-        written_at: time of writing, s since 1970; in the workers' files only.
-    """
+    """A line of the log."""
 
     __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]  # a line that states settings is of another format
 
-    task: Name
-    memory_type: Name
-    episode: Whole
-    seed: NotRequired[Whole | None]
-    variant: NotRequired[Count | None]
-    prompt_steps: NotRequired[Count | None]
-    prompt_shown: NotRequired[bool | None]
-    steps: NotRequired[Count | None]
-    paused_steps: NotRequired[Whole]
-    held_steps: NotRequired[Whole]
-    corrupted: NotRequired[bool]
-    success: bool
-    choice: NotRequired[Count | None]
+    task: Name  # name in the catalogue
+    memory_type: Name  # temporal, spatial, object or procedural; the suite of a task of LIBERO
+    episode: Whole  # number of the episode in its evaluation, from 0
+    seed: NotRequired[Whole | None]  # seed of the scene: seed base + episode, except in evidence episodes
+    variant: NotRequired[Count | None]  # index of the task's variant; 0 is the published one
+    prompt_steps: NotRequired[Count | None]  # control steps before the execution
+    prompt_shown: NotRequired[bool | None]  # whether the demonstration prompt succeeded; None without a prompt
+    steps: NotRequired[Count | None]  # execution steps
+    paused_steps: NotRequired[Whole]  # control steps of pauses; only with pauses
+    held_steps: NotRequired[Whole]  # control steps of holds; strict tasks only
+    corrupted: NotRequired[bool]  # whether the memory was corrupted before the episode ended; only with corruption
+    success: bool  # whether the goal held at the end
+    choice: NotRequired[Count | None]  # evidence episodes: variant that the policy acted on; None for no variant
+    # evidence episodes: whether the policy gave an answer. A wrong answer may fit no variant
     answered: NotRequired[bool]
-    variants: NotRequired[Count]
+    variants: NotRequired[Count]  # evidence episodes: number of variants of the task
+    # evidence episodes: rate of correct choices without memory; None if the instruction names the variant
     chance: NotRequired[Number | None]
-    checkpoints: list[CheckpointRecord]
-    failure: NotRequired[Name | None]
-    fault: NotRequired[str]
-    lost: NotRequired[bool]
-    stand_ins: NotRequired[list[Name]]
-    scene_hash: NotRequired[Name | None]
-    settled: NotRequired[bool]
-    wall_s: NotRequired[Number | None]
-    not_run: NotRequired[str]
-    written_at: NotRequired[Number]
+    checkpoints: list[CheckpointRecord]  # memory checkpoints in the task's order
+    failure: NotRequired[Name | None]  # failure class; None for a success
+    fault: NotRequired[str]  # reason why the episode was aborted: an invalid action or unstable physics
+    lost: NotRequired[bool]  # strict tasks: whether the goal became unreachable
+    stand_ins: NotRequired[list[Name]]  # classes whose missing scans this package's objects replaced
+    scene_hash: NotRequired[Name | None]  # hash of the initial scene
+    settled: NotRequired[bool]  # false if an object was thrown, or still moved, when the scene began; absent otherwise
+    wall_s: NotRequired[Number | None]  # duration of the episode, s
+    not_run: NotRequired[str]  # reason why the episode could not be run. Such a line is no rollout and enters no rate
+    written_at: NotRequired[Number]  # time of writing, s since 1970; in the workers' files only
 
 
 def episode_record(episode: Episode, number: int, wall_s: float) -> dict[str, Any]:
@@ -190,8 +157,7 @@ def seed_base(record: Mapping[str, Any]) -> int:
 class EpisodeLog:
     """Append finished rollouts of this process to ``directory``, which is created when the first rollout ends.
 
-    Args:
-        facts: content of the evaluation's file, which is written before the first line; None if it is there.
+    ``facts``: content of the evaluation's file, which is written before the first line; None if it is there.
     """
 
     def __init__(self, directory: str | Path, facts: Mapping[str, Any] | None = None) -> None:
@@ -199,15 +165,9 @@ class EpisodeLog:
         self._facts = facts
 
     def append(self, record: Mapping[str, Any]) -> Path:
-        """Write one rollout durably and return its file.
-
-        The process id is read here, not at construction: a log may be constructed before a fork.
-
-        Raises:
-            MemobenchError: the folder cannot be written or holds episodes of another protocol, the record is not JSON,
-                or its task's name is not a file name.
-        """
+        """Write one rollout durably and return its file; refuse a folder with episodes of another protocol."""
         task = file_name(record["task"], "the task of a record of an episode")
+        # The process id is not read earlier, because a log may be constructed before a fork.
         path = self.directory / EPISODES_FOLDER / f"{task}.{os.getpid()}.jsonl"
         try:
             line = json.dumps({**record, WRITTEN_AT: time.time()}, allow_nan=False).encode() + b"\n"
@@ -280,10 +240,7 @@ def read_episodes(directory: str | Path, problems: list[str] | None = None) -> l
 
 
 def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return all episodes logged in ``directory``, each with the facts of the evaluation's file.
-
-    Arguments and errors as of `read_lines` and `joined`; also raises without an evaluation's file.
-    """
+    """Return all episodes logged in ``directory`` (`read_lines`), each with the facts of the evaluation's file."""
     lines = read_lines(directory, problems)
     return joined(Path(directory), read_evaluation(Path(directory)), lines)
 
@@ -291,8 +248,7 @@ def read_log(directory: str | Path, problems: list[str] | None = None) -> list[d
 def joined(folder: Path, card: Mapping[str, Any], lines: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return lines with the facts of their evaluation's file: settings, inputs, and ``policy``, its identity.
 
-    Raises:
-        MemobenchError: no episode of these settings can have written a line.
+    Refuse a line that no episode of these settings can have written.
     """
     facts = {name: value for name, value in card["protocol"].items() if name not in EXTENT}
     policy = card[POLICY].get("identity") or card[POLICY].get("type")
@@ -310,7 +266,7 @@ def joined(folder: Path, card: Mapping[str, Any], lines: Iterable[Mapping[str, A
 
 
 def _contradictions(record: Mapping[str, Any], own_tasks: bool) -> Iterator[str]:
-    """Yield what a line states that its settings exclude: it is of another evaluation, or was changed."""
+    # A line that contradicts its settings is of another evaluation, or was changed.
     base, evidence, pauses = record.get("seed_base"), record.get("evidence"), record.get("pause_steps")
     if None not in (base, record.get("seed")) and seed_base(record) != base:
         yield f"seed_base: {base} and {seed_base(record)}"
@@ -341,42 +297,30 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
 
     Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
     counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
-    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes.
-
-    Raises:
-        MemobenchError: the folder does not exist or contains no log.
+    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes. Raise without a log.
     """
     directory = Path(directory)
     files = _log_files(directory)
     if not files:
         raise _without_log(directory)
     faults: list[str] = []
-    newest: dict[Key, tuple[float, dict[str, Any]]] = {}
-    outcomes: dict[Key, set[bool]] = {}
-    for file in files:
-        for line in _read_file(file, faults):
-            written = float(line.pop(WRITTEN_AT, 0.0))
-            key = key_of(line)
-            if "not_run" not in line:
-                outcomes.setdefault(key, set()).add(line["success"])
-            if key not in newest or written >= newest[key][0]:
-                newest[key] = (written, line)
-    twice = sorted(key for key, values in outcomes.items() if len(values) > 1)
-    if twice:
+    lines = [line for file in files for line in _read_file(file, faults)]
+    lines.sort(key=lambda line: line.get(WRITTEN_AT, 0.0))  # stable: of equal times, the last file counts
+    newest = {key_of(line): line for line in lines}
+    outcomes = {(key_of(line), line["success"]) for line in lines if "not_run" not in line}
+    if twice := sorted(key for key in newest if {(key, True), (key, False)} <= outcomes):
         faults.append(
             f"{directory} has lines of success and of failure about {count_of(len(twice), 'episode')}, the first is "
             f"{twice[0][0]}, episode {twice[0][1]}; the newest line of each counts"
         )
     if problems is not None:
         problems += faults
-    else:
-        for fault in faults:
-            logger.warning("%s", fault)
-    return [newest[key][1] for key in sorted(newest)]
+    for fault in faults if problems is None else ():
+        logger.warning("%s", fault)
+    return [{name: value for name, value in newest[key].items() if name != WRITTEN_AT} for key in sorted(newest)]
 
 
 def _without_log(directory: Path) -> MemobenchError:
-    """Return the error for a folder without a log, with the folder that may have been meant."""
     if not directory.is_dir():
         hint = f", such as {directory.parent}" if directory.is_file() and _log_files(directory.parent) else ""
         return MemobenchError(f"{directory} is not a folder; expected one that an evaluation has written{hint}")
@@ -422,7 +366,7 @@ def is_archive(directory: Path) -> bool:
 
 
 def _log_files(directory: Path) -> list[Path]:
-    """Return the merged file first: its lines have no time, so lines of the workers' files replace them."""
+    # The merged file is first: its lines have no time, so lines of the workers' files replace them.
     merged = directory / MERGED_FILE
     whole = [path for path in (packed(merged), merged) if path.is_file()]
     return whole + sorted((directory / EPISODES_FOLDER).glob("*.jsonl"))

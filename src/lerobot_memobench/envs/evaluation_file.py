@@ -35,18 +35,11 @@ MOST_EPISODES = 100_000
 
 @dataclass(frozen=True)
 class Acting:
-    """The policy of an evaluation, as its file names it. It is unknown in gymnasium and in LeRobot's trainings.
+    """The policy of an evaluation, as its file names it. It is unknown in gymnasium and in LeRobot's trainings."""
 
-    Attributes:
-        policy: ``type``, ``identity`` and, for a checkpoint in a folder, ``sha256``; {} if unknown.
-        inputs: inputs of the policy in words; None if unknown.
-        seeds: seeds of the requested episodes; None if unknown. Whole batches are run, so there may be other
-            episodes, which are not logged.
-    """
-
-    policy: Mapping[str, Any] = field(default_factory=dict)
-    inputs: str | None = None
-    seeds: range | None = None
+    policy: Mapping[str, Any] = field(default_factory=dict)  # `Policy`
+    inputs: str | None = None  # in words
+    seeds: range | None = None  # of the requested episodes; whole batches are run, and others are not logged
 
     def counts(self, seed: int) -> bool:
         """Return whether the episode of a seed was requested."""
@@ -79,15 +72,10 @@ Settings: Any = TypedDict("Settings", _FIELDS, total=False)  # type: ignore[misc
 
 
 class Protocol(Settings, total=False):
-    """The protocol of an evaluation; one of `lerobot eval` contains ``tasks`` and ``episodes``.
+    """The protocol of an evaluation; one of `lerobot eval` contains ``tasks`` and ``episodes``."""
 
-    Attributes:
-        tasks: names, sorted.
-        episodes: number requested per task.
-    """
-
-    tasks: list[Name]
-    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]
+    tasks: list[Name]  # names, sorted
+    episodes: Annotated[int, Ge(0), Le(MOST_EPISODES)]  # number requested per task
 
 
 class PolicySettings(TypedDict, total=False):
@@ -99,105 +87,61 @@ class PolicySettings(TypedDict, total=False):
 
 
 class Policy(TypedDict, total=False):
-    """Identity of a policy; {} if unknown.
+    """Identity of a policy; {} if unknown."""
 
-    Attributes:
-        type: type registered with LeRobot.
-        identity: the type, and a hash over the checkpoint and the settings that differ from it.
-        seed: LeRobot's seed in this evaluation.
-        settings: complete configuration.
-        sha256: hash over the checkpoint's files.
-        detector_sha256: hash of the detector's weights.
-    """
-
-    type: Name | None
-    identity: Name
-    seed: Whole | None
-    settings: PolicySettings
-    sha256: str | None
-    detector_sha256: str
+    type: Name | None  # type registered with LeRobot
+    identity: Name  # the type, and a hash over the checkpoint and the settings that differ from it
+    seed: Whole | None  # LeRobot's seed in this evaluation
+    settings: PolicySettings  # complete configuration
+    sha256: str | None  # hash over the checkpoint's files
+    detector_sha256: str  # hash of the detector's weights
 
 
 class ModelFiles(TypedDict):
-    """Location of a policy's weights, and the hash of each file.
+    """Location of a policy's weights, and the hash of each file."""
 
-    Attributes:
-        path: folder, repository, or name of a policy of the package.
-        revision: commit of a repository.
-        files: name -> SHA-256.
-    """
-
-    path: str
-    revision: NotRequired[str | None]
-    files: NotRequired[dict[str, str]]
+    path: str  # folder, repository, or name of a policy of the package
+    revision: NotRequired[str | None]  # commit of a repository
+    files: NotRequired[dict[str, str]]  # name -> SHA-256
 
 
 class Start(TypedDict):
-    """One start of the evaluation, on one machine.
+    """One start of the evaluation, on one machine."""
 
-    Attributes:
-        command: words of the command line.
-        batch_size: number of parallel environments.
-        versions: versions of Python and packages.
-        git_commit: commit of this package, in a checkout.
-        machine: processor, cores, GPU, operating system.
-        times: number of equal starts.
-    """
-
-    command: list[str]
-    batch_size: Annotated[int, Ge(1), Le(LARGEST)]
-    versions: dict[str, str]
-    git_commit: str | None
-    machine: dict[str, Any]
-    times: NotRequired[Count]
+    command: list[str]  # words of the command line
+    batch_size: Annotated[int, Ge(1), Le(LARGEST)]  # number of parallel environments
+    versions: dict[str, str]  # versions of Python and packages
+    git_commit: str | None  # commit of this package, in a checkout
+    machine: dict[str, Any]  # processor, cores, GPU, operating system
+    times: NotRequired[Count]  # number of equal starts
 
 
 class CardSettings(TypedDict, total=False):
-    """Settings of an evaluation that its protocol does not hold, see `rollouts.settings.EvaluationSettings`.
-
-    Attributes:
-        env: other fields of `MemobenchEnvConfig`, such as tasks and videos.
-        policy: ``path`` or ``type``, and the given settings of the policy's configuration.
-        batch_size: environments at once.
-        use_async_envs: whether each has a process of its own.
-        rename_map: names of the environment's observations -> names of the policy's.
-    """
+    """Settings of an evaluation that its protocol does not hold, see `rollouts.plan.EvaluationSettings`."""
 
     __pydantic_config__ = {"extra": "forbid"}  # type: ignore[misc]
 
-    env: dict[str, Any]
+    env: dict[str, Any]  # other fields of `MemobenchEnvConfig`, such as tasks and videos
+    # ``path`` or ``type``, and the given settings of the policy's configuration
     policy: dict[str, str | bool | float | list[Any] | None]
-    batch_size: Annotated[int, Ge(0), Le(512)] | None
-    use_async_envs: bool | None
-    rename_map: dict[str, str]
+    batch_size: Annotated[int, Ge(0), Le(512)] | None  # environments at once
+    use_async_envs: bool | None  # whether each has a process of its own
+    rename_map: dict[str, str]  # names of the environment's observations -> names of the policy's
 
 
 class Card(TypedDict):
-    """The content of the file. To resume, merge or rerun an evaluation, all fields are required.
+    """The content of the file. To resume, merge or rerun an evaluation, all fields are required."""
 
-    Attributes:
-        format: version of the format.
-        protocol: tasks, episodes, and the settings that must agree between two evaluations to be compared.
-        policy: facts that must agree to resume the evaluation.
-        written: time.
-        checkpoint: of the policy; None for a policy without one.
-        trained_on: LeRobot's settings of the training dataset.
-        task_files: task -> hash of its files.
-        settings: what `memobench rerun` repeats besides the protocol.
-        shard: part of a larger evaluation, or None.
-        runs: each start, on each machine.
-    """
-
-    format: Literal[3]
-    protocol: Protocol
-    policy: Policy
-    written: NotRequired[str]
-    checkpoint: NotRequired[ModelFiles | None]
-    trained_on: NotRequired[dict[str, Any] | None]
-    task_files: NotRequired[dict[str, str]]
-    settings: NotRequired[CardSettings]
-    shard: NotRequired[str | None]
-    runs: NotRequired[Annotated[list[Start], MinLen(1)]]
+    format: Literal[3]  # version of the format
+    protocol: Protocol  # tasks, episodes, and the settings that must agree between two evaluations to be compared
+    policy: Policy  # facts that must agree to resume the evaluation
+    written: NotRequired[str]  # time
+    checkpoint: NotRequired[ModelFiles | None]  # of the policy; None for a policy without one
+    trained_on: NotRequired[dict[str, Any] | None]  # LeRobot's settings of the training dataset
+    task_files: NotRequired[dict[str, str]]  # task -> hash of its files
+    settings: NotRequired[CardSettings]  # what `memobench rerun` repeats besides the protocol
+    shard: NotRequired[str | None]  # part of a larger evaluation, or None
+    runs: NotRequired[Annotated[list[Start], MinLen(1)]]  # each start, on each machine
 
 
 # --- reading and writing ---
@@ -209,9 +153,6 @@ def read_evaluation(place: Path, *, whole: bool = False) -> dict[str, Any]:
     """Return the content of an evaluation's file; ``place``: its folder, or the file.
 
     With ``whole``, require everything that resuming and repeating need.
-
-    Raises:
-        MemobenchError: the file is missing, incomplete, malformed or of another format.
     """
     file = _file_of(place)
     try:
@@ -247,11 +188,7 @@ def facts_of(settings: EnvSettings, acting: Acting) -> dict[str, Any]:
 
 
 def check_facts(folder: Path, facts: Mapping[str, Any]) -> None:
-    """Refuse a folder with an evaluation of another protocol or policy.
-
-    Raises:
-        MemobenchError: the first values are those of the folder.
-    """
+    """Refuse a folder with an evaluation of another protocol or policy."""
     if not has_evaluation(folder):
         return
     if unequal := differences_of_parts(read_evaluation(folder), facts):
@@ -283,9 +220,8 @@ def differences(
 ) -> list[str]:
     """Return the settings in which two protocols differ, each as ``horizon: 1200 and 600``.
 
-    A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`).
-
-    ``extent``: whether tasks and number of episodes are compared.
+    A setting that one protocol omits is no difference. Neither is the version of scene hashes (`other_hashes`), nor,
+    without ``extent``, tasks and number of episodes.
     """
     left_out = {*ignore, POLICY, SCENE_HASHES, *(() if extent else EXTENT)}
     return _differing({name: value for name, value in a.items() if name not in left_out}, b)

@@ -38,6 +38,7 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import AUTO, INTACT, RESET, STEPS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import (
+    check_states,
     find_tasks,
     group_of,
     lerobots_choice,
@@ -46,7 +47,6 @@ from lerobot_memobench.tasks.catalogue import (
     task_folder,
     task_index,
 )
-from lerobot_memobench.tasks.libero_suites import check_states
 from lerobot_memobench.tasks.task import LIBERO_SUITES, STRICT
 
 Opener = Callable[[Path, int, bool], gym.vector.VectorEnv]
@@ -109,8 +109,7 @@ class MemobenchEnvConfig(_WithSettings):
     resume: bool = False
     fps: int = CONTROL_HZ
     check_policy: ClassVar[Callable[[MemobenchEnvConfig], tuple[Any, Acting]]] = lambda config: (None, UNKNOWN_POLICY)
-    """Checks the policy of LeRobot's own commands; returns its configuration, None if unknown, and its description for
-    the log. Set by `registration`, because policies depend on environments."""
+    """`prepare_lerobots_command`. `registration` sets it, because policies depend on environments."""
     features: dict[str, PolicyFeature] = field(default_factory=policy_features)
     features_map: dict[str, str] = field(default_factory=policy_names)
 
@@ -142,15 +141,11 @@ class MemobenchEnvConfig(_WithSettings):
         return asdict(self.settings)
 
     def selected(self) -> list[tuple[str, int, Path]]:
-        """Return memory type, task id and folder of each chosen task that the controls apply to.
-
-        `evidence` needs variants of published tasks; corruption at step 0, `reshow` and `interference` need a prompt.
-
-        Raises:
-            MemobenchError: a task is unknown or of another suite, or a control applies to no chosen task.
-        """
-        tasks: list[tuple[str, int, Path]]
-        if self.task_dir is not None:
+        """Return memory type, task id and folder of each chosen task that the controls apply to; raise without one."""
+        if self.task_dir is None:
+            names = resolve_tasks(self.tasks, self.suite)
+            tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
+        else:
             loaded = [load_task(folder) for folder in find_tasks(self.task_dir)]
             for task in loaded:
                 if task.suite != self.suite:
@@ -159,9 +154,6 @@ class MemobenchEnvConfig(_WithSettings):
                         f"suite={task.suite} for folders of such tasks"
                     )
             tasks = [(task.memory_type, index, task.folder) for index, task in enumerate(loaded)]
-        else:
-            names = resolve_tasks(self.tasks, self.suite)
-            tasks = [(group_of(name), task_index(name), task_folder(name)) for name in names]
         if self.settings.needs_prompt:
             tasks = [task for task in tasks if load_task(task[2]).prompt is not None]
             if not tasks:
@@ -169,22 +161,20 @@ class MemobenchEnvConfig(_WithSettings):
                     "corrupt= (at step 0), reshow= and interference= act on the demonstration prompt, and no chosen "
                     "task has one; choose object or procedural tasks, or set corrupt_step="
                 )
-        if not self.evidence or self.suite == STRICT:  # its tasks with one variant run each scene once
-            return tasks
-        with_variants = [task for task in tasks if load_task(task[2]).num_variants > 1]
-        if not with_variants:
-            raise MemobenchError(
-                "env.evidence=true runs each scene with each variant, but no chosen task has variants; choose object "
-                "or procedural tasks, or suite=strict"
-            )
-        return with_variants
+        if self.evidence and self.suite != STRICT:  # strict tasks with one variant run each scene once
+            tasks = [task for task in tasks if load_task(task[2]).num_variants > 1]
+            if not tasks:
+                raise MemobenchError(
+                    "env.evidence=true runs each scene with each variant, but no chosen task has variants; choose "
+                    "object or procedural tasks, or suite=strict"
+                )
+        return tasks
 
     @ending_lerobots_command()
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """Return ``{memory type: {task id: vector env}}``; the first reset of an env starts its simulation.
+        """Return ``{memory type or suite of LIBERO: {task id: vector env}}`` for LeRobot's own commands.
 
-        A suite of LIBERO replaces the memory type, as in LeRobot's environment ``libero``. LeRobot's own commands call
-        this; ``prompt_in=auto`` then means `STEPS`.
+        The first reset of an env starts its simulation.
         """
         envs: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         if self.task is not None:  # suites of LIBERO, each with its own defaults and folder of its log
@@ -200,18 +190,16 @@ class MemobenchEnvConfig(_WithSettings):
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         policy, by = type(self).check_policy(self)
-        self.declare_plans(policy)
-        opened = self.opener(None, by, self.resolved_log_dir())
+        planned = self.settings_for(policy)
+        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
+        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
+        opened = self.opener(None, by, self.resolved_log_dir())  # None: prompts play in steps
         for memory_type, task_id, folder in chosen:
             envs.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return envs
 
     def _number_as_lerobot(self) -> None:
-        """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state.
-
-        Raises:
-            MemobenchError: there are more episodes than initial states.
-        """
+        """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state."""
         if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
             return
         from lerobot.configs.default import EvalConfig
@@ -223,26 +211,11 @@ class MemobenchEnvConfig(_WithSettings):
         episodes = int(parser.parse_arg("eval.n_episodes") or EvalConfig.n_episodes)
         check_states(self.suite, seed - self.seed_base, episodes)
 
-    def declare_plans(self, policy: Any) -> None:
-        """Set the actions and frames of a plan from a policy's configuration; the rest is the user's.
-
-        LeRobot's trainer opens environments without the policy. Errors as of `settings_for`.
-        """
-        planned = self.settings_for(policy)
-        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
-        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
-
     def settings_for(self, policy: Any) -> EnvSettings:
-        """Return the settings with defaults that follow from a policy's configuration (None if unknown).
-
-        Raises:
-            MemobenchError: ``replan_steps`` is no multiple of the actions that the policy executes per plan, or these
-                are unknown in strict tasks.
-        """
-        settings = self.settings
+        """Return the settings with defaults that follow from a policy's configuration (None if unknown)."""
+        settings, executed = self.settings, executed_actions(policy)
         if settings.prompt_in == AUTO:
             settings = settings.changed(prompt_in=STEPS if policy is None or reads_prompt(policy) else RESET)
-        executed = executed_actions(policy)
         if settings.replan_steps is None:
             if self.suite == STRICT and (policy is None or getattr(policy, "plans_unseen", False)):
                 raise MemobenchError(UNKNOWN_PLAN.format("env.replan_steps"))
@@ -258,12 +231,9 @@ class MemobenchEnvConfig(_WithSettings):
         return settings.changed(window_steps=max(settings.window_steps, observed))
 
     def opener(self, policy: Any, by: Acting, log_dir: Path) -> Opener:
-        """Return a function that opens the vector environment of a task for a policy.
+        """Return a function that opens the vector environment of a task for a policy; refuse another protocol's log.
 
         ``policy``: its configuration, None if unknown. ``by``: its description for the log.
-
-        Raises:
-            MemobenchError: ``log_dir`` contains a log of another protocol.
         """
         from lerobot_memobench.envs.env import MemobenchEnv, SkipLogged
 
@@ -271,9 +241,7 @@ class MemobenchEnvConfig(_WithSettings):
         check_facts(log_dir, facts_of(settings, by))  # fail before the first episode
 
         def opened(folder: Path, rows: int, use_async_envs: bool) -> gym.vector.VectorEnv:
-            make: Callable[[], gym.Env[Any, Any]] = partial(
-                MemobenchEnv, str(folder), settings, log_dir=str(log_dir), acting=by
-            )
+            make: Any = partial(MemobenchEnv, str(folder), settings, log_dir=str(log_dir), acting=by)
             if self.resume:
                 make = partial(SkipLogged, make, log_dir, settings)
             return _vector([make] * rows, settings, use_async_envs and rows > 1)
@@ -299,12 +267,10 @@ def executed_actions(policy: Any) -> int:
     stated = max(getattr(policy, name, None) or 0 for name in EXECUTED)
     if getattr(policy, "type", None) != "groot":
         return stated
-    from lerobot.policies.groot.configuration_groot import infer_groot_n1_7_action_execution_horizon
+    from lerobot.policies.groot.configuration_groot import infer_groot_n1_7_action_execution_horizon as horizon
 
     # GR00T executes no more actions than its base model was made for.
-    return min(
-        stated, infer_groot_n1_7_action_execution_horizon(policy.base_model_path, policy.embodiment_tag) or stated
-    )
+    return min(stated, horizon(policy.base_model_path, policy.embodiment_tag) or stated)
 
 
 def check_loop(settings: EnvSettings) -> None:
@@ -338,7 +304,7 @@ class ClockProcessorStep(ObservationProcessorStep):
     """Reshape phase and step from (B, 1) to (B,), the shape of one-number columns in a LeRobot training batch."""
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Reshape; see the class."""
+        """Reshape the two."""
         return {key: value.reshape(len(value)) if key in CLOCK else value for key, value in observation.items()}
 
     def transform_features(

@@ -11,15 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from lerobot_memobench.constants import (
-    ACTION_DIM,
-    CONTROL_HZ,
-    ENDED,
-    EXECUTION,
-    PROMPT,
-    PROMPT_HORIZON,
-    PROPRIO_DIM,
-)
+from lerobot_memobench.constants import ACTION_DIM, CONTROL_HZ, ENDED, EXECUTION, PROMPT, PROMPT_HORIZON, PROPRIO_DIM
 from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, PIXELS, EnvSettings
 from lerobot_memobench.envs.video import annotate
 from lerobot_memobench.errors import MemobenchError
@@ -92,10 +84,9 @@ def check_obs_type(policy: Any, obs_type: str, suite: str = PUBLISHED) -> None:
 
 
 def policy_inputs(policy: Any, obs_type: str, oracle_memory: bool = False) -> str:
-    """Return the names of a policy's inputs, without the arm's state; everything in ``obs_type`` if unknown.
+    """Return the names of a policy's inputs, without the arm's state: its declared ``inputs``, else those of LeRobot.
 
-    ``policy`` is a configuration or its class. A declared attribute ``inputs`` is returned. With ``oracle_memory`` the
-    instruction ends with the completed checkpoints.
+    ``policy`` is a configuration or its class; an unknown one reads everything in ``obs_type``.
     """
     inputs = getattr(policy, "inputs", None)
     if not isinstance(inputs, tuple):
@@ -126,28 +117,23 @@ def policy_features(settings: EnvSettings = DEFAULTS) -> dict[str, PolicyFeature
     from lerobot.configs import FeatureType, PolicyFeature
 
     image = (settings.observation_height, settings.observation_width, 3)
-    shapes: dict[str, tuple[FeatureType, tuple[int, ...]]] = {
-        "action": (FeatureType.ACTION, (ACTION_DIM,)),
-        **dict.fromkeys(_image_keys(settings), (FeatureType.VISUAL, image)),
-        **({"environment_state": (FeatureType.ENV, (SIZE,))} if settings.obs_type != PIXELS else {}),
-        "agent_pos": (FeatureType.STATE, (PROPRIO_DIM,)),
+    known = {
+        "action": PolicyFeature(FeatureType.ACTION, (ACTION_DIM,)),
+        "environment_state": PolicyFeature(FeatureType.ENV, (SIZE,)),
+        "agent_pos": PolicyFeature(FeatureType.STATE, (PROPRIO_DIM,)),
     }
-    return {name: PolicyFeature(type=kind, shape=shape) for name, (kind, shape) in shapes.items()}
+    return {name: known.get(name, PolicyFeature(FeatureType.VISUAL, image)) for name in policy_names(settings)}
 
 
 def policy_names(settings: EnvSettings = DEFAULTS) -> dict[str, str]:
     """Return the environment's name -> the policy's name of each feature."""
+    images = () if settings.obs_type == OBJECTS else settings.images.values()
     return {
         "action": "action",
-        **_image_keys(settings),
+        **{f"pixels/{name}": f"observation.images.{name}" for name in images},
         **({"environment_state": "observation.environment_state"} if settings.obs_type != PIXELS else {}),
         "agent_pos": "observation.state",
     }
-
-
-def _image_keys(settings: EnvSettings) -> dict[str, str]:
-    names = () if settings.obs_type == OBJECTS else settings.images.values()
-    return {f"pixels/{name}": f"observation.images.{name}" for name in names}
 
 
 def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
@@ -174,10 +160,9 @@ def observation_space(settings: EnvSettings, longest: int) -> spaces.Dict:
                 for name, group in ROBOT_STATE.items()
             }
         )
-    if settings.expert_action:
-        parts["expert_action"] = action_space()
-    if settings.blind_action:
-        parts["blind_action"] = action_space()
+    for name in ("expert_action", "blind_action"):
+        if getattr(settings, name):
+            parts[name] = action_space()
     return spaces.Dict(parts)
 
 
@@ -199,9 +184,8 @@ def blank(space: spaces.Space[Any]) -> Any:
 class Observer:
     """Render images and compute objects only for frames that are read.
 
-    Attributes:
-        needed: whether the policy reads the following frames. If not, observations repeat an earlier frame, except
-            for the first and the last frame of the execution, and the frame before which memory is corrupted.
+    While they are not ``needed`` by the policy, observations repeat an earlier frame, except for the first and the last
+    frame of the execution, and the frame before which memory is corrupted.
     """
 
     def __init__(self, settings: EnvSettings) -> None:

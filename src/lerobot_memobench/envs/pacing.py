@@ -27,13 +27,9 @@ FEWEST_STEPS_AWAY = 2
 
 
 class Pacing:
-    """Map the policy's actions to the actions that are executed.
+    """Map the policy's actions to the actions that are executed; ``rng`` draws the starts of pauses.
 
     At a ``speed`` of 1/n an action takes n control steps, each with 1/n of its displacement.
-
-    Attributes:
-        pauses: whether the settings contain pauses, whose starts ``rng`` draws.
-        paused_steps, held_steps: control steps of pauses and of holds so far.
     """
 
     def __init__(self, settings: EnvSettings, rng: np.random.Generator) -> None:
@@ -45,7 +41,7 @@ class Pacing:
         self._step = 0  # within the current chunk
         self._until_pause = self._pause_interval()  # execution steps
         self._rests = self._held = 0  # remaining steps of this pause, of this hold
-        self.paused_steps = self.held_steps = 0
+        self.paused_steps = self.held_steps = 0  # so far
         self._shortest_hold = shortest_hold(settings)
 
     def _pause_interval(self) -> int:
@@ -105,15 +101,6 @@ def longest(settings: EnvSettings) -> int:
     shortest, round_up = shortest_hold(settings), chunk * steps_per_action(settings.speed)
     drawn = MOST_HOLDS * (max(LONGEST_HOLD, shortest) + round_up)
     return steps + pauses + drawn + steps // FEWEST_STEPS_AWAY * (shortest + round_up)
-
-
-def paused(pause_steps: int, replan_steps: int | None, steps: int) -> range:
-    """Return the possible numbers of paused steps after so many execution steps at full speed, empty without pauses."""
-    chunk = replan_steps or 1
-    pause = _whole_chunks(pause_steps, chunk)
-    fewest, most = STEPS_BETWEEN_PAUSES
-    # A rollout may end in a pause.
-    return range(max(steps // (most + chunk - 1) - 1, 0) * pause, (steps // fewest + 1) * pause)
 
 
 def _whole_chunks(steps: int, chunk: int) -> int:

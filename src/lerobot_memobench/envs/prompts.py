@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
-from lerobot_memobench.experts.demonstration_prompt import PromptDemonstrator
+from lerobot_memobench.experts.expert import PromptDemonstrator
 from lerobot_memobench.io import cache_folder, draft_of, files_below
 from lerobot_memobench.sim.simulation import Simulation, Snapshot
 from lerobot_memobench.tasks.task import Task
@@ -36,19 +36,12 @@ SOURCES = ("tasks", "sim", "experts", "envs")
 
 
 class PromptPlayer:
-    """Simulate a prompt step by step.
-
-    The scene of ``sim`` is in the episode's initial state. ``longest``: maximum number of control steps. ``file``:
-    cache file of the finished prompt, or None.
-
-    Attributes:
-        over, succeeded: whether the prompt has ended, and then whether it succeeded.
-        observed: whether frames before the end are read; if not, a restored prompt skips them.
-    """
+    """Simulate a prompt of at most ``longest`` control steps from the initial state; store it in ``file``."""
 
     over = False
     succeeded = False
     observed = True
+    """Whether frames before the end are read; if not, a restored prompt skips them."""
 
     def __init__(self, demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> None:
         self._demonstrator, self._sim, self._longest, self._file = demonstrator, sim, longest, file
@@ -102,7 +95,6 @@ the highlight (NaN without one). The physics of the snapshot follow."""
 
 
 def _row(action: NDArray[np.float32], sim: Simulation) -> NDArray[np.float64]:
-    """Return a control step as (sum of `_PARTS` + `Simulation.physics_dim`,)."""
     at, lit = sim.snapshot(), sim.highlights
     highlight = (*lit[0].position, lit[0].radius) if lit else (np.nan,) * 4
     parts = action, at.goal_position, at.goal_rotation.ravel(), at.gripper, [at.goes_on], highlight, at.physics
@@ -110,26 +102,22 @@ def _row(action: NDArray[np.float32], sim: Simulation) -> NDArray[np.float64]:
 
 
 def prompt_player(demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> PromptPlayer:
-    """Return a prompt that is restored if ``file`` contains it, else simulated. Arguments: see `PromptPlayer`."""
+    """Return a prompt that is restored if ``file`` contains it, else simulated."""
     stored = None if file is None else _read(file, sum(_PARTS) + sim.physics_dim)
     return PromptPlayer(demonstrator, sim, longest, file) if stored is None else RestoredPrompt(sim, *stored)
 
 
 def prompt_file(task: Task, seed: int, scene_hash: str) -> Path | None:
-    """Return the cache file of a prompt; None if the cache is off.
-
-    The name is a hash of everything that affects the prompt. It includes the hash of the initial scene, the result of
-    250 physics steps, which separates machines with different arithmetic.
-    """
+    """Return the cache file of a prompt, named by a hash of everything that affects it; None if the cache is off."""
     if os.environ.get(VARIABLE, "").lower() in ("off", "0", "false", "no"):
         return None
+    # The initial scene is the result of 250 physics steps: its hash separates machines with different arithmetic.
     content = dataclasses.replace(task, folder=Path()), task.bddl_text, seed, scene_hash, _code()
     return cache_folder() / "prompts" / f"{hashlib.sha256(repr(content).encode()).hexdigest()[:32]}.npz"
 
 
 @cache
 def _code() -> tuple[str, ...]:
-    """Return the sources, library versions and Python version that compute a prompt."""
     package = Path(__file__).parents[1]
     digest = hashlib.sha256((package / "constants.py").read_bytes())
     for source in sorted(file for part in SOURCES for file in files_below(package / part, ".py")):
@@ -138,7 +126,6 @@ def _code() -> tuple[str, ...]:
 
 
 def _read(file: Path, width: int) -> tuple[NDArray[np.float64], bool] | None:
-    """Return the rows in a file; None if the file is missing, damaged or of another prompt."""
     try:
         with np.load(file, allow_pickle=False) as stored:
             name, rows, succeeded = str(stored["name"]), stored["rows"], bool(stored["succeeded"])
@@ -152,14 +139,13 @@ def _read(file: Path, width: int) -> tuple[NDArray[np.float64], bool] | None:
 
 
 def _write(file: Path, rows: NDArray[np.float64], succeeded: bool) -> None:
-    """Write a prompt; remove the least recently used files beyond `LARGEST` bytes."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         with draft_of(file) as draft:
             np.savez_compressed(draft, name=np.array(file.name), rows=rows, succeeded=np.array(succeeded))
         _make_room(file.parent)
     except OSError as error:
-        _warn(f"prompts cannot be cached in {file.parent} ({error.strerror or error}); set {VARIABLE}=off")
+        _warn_once(f"prompts cannot be cached in {file.parent} ({error.strerror or error}); set {VARIABLE}=off")
 
 
 def _make_room(folder: Path) -> None:
@@ -176,6 +162,5 @@ def _make_room(folder: Path) -> None:
 
 
 @cache
-def _warn(text: str) -> None:
-    """Log a warning once per process."""
+def _warn_once(text: str) -> None:
     logger.warning(text)

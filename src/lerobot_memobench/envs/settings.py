@@ -26,7 +26,7 @@ from lerobot_memobench.constants import (
 )
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.sim.convention import CONVENTIONS, LIBERO_CAMERAS, MIRRORED, UPRIGHT, image_names
-from lerobot_memobench.tasks.libero_suites import STEP_LIMITS
+from lerobot_memobench.tasks.catalogue import STEP_LIMITS
 from lerobot_memobench.tasks.task import (
     DIFFICULTIES,
     DRAWN,
@@ -97,17 +97,13 @@ def setting(default: Any, meaning: str, values: Sequence[str] = (), least: int |
         least: smallest accepted integer.
         usual: the default in words, where it depends on other settings or on the policy.
     """
-    details = {"meaning": meaning, "values": tuple(values), "least": least, "usual": usual}
-    return field(default=default, metadata=details)
+    metadata = {"meaning": meaning, "values": tuple(values), "least": least, "usual": usual}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class EnvSettings:
-    """Settings of one environment; the metadata of each field are its entry in help and reference (`setting`).
-
-    Raises:
-        MemobenchError: a value is not accepted, or two settings are incompatible.
-    """
+    """Settings of one environment; raise for values that are not accepted, and for incompatible settings."""
 
     suite: str = setting(
         PUBLISHED,
@@ -210,7 +206,7 @@ class EnvSettings:
     )
 
     def __post_init__(self) -> None:
-        self._set(**{name: value for name, value in self.usual.items() if getattr(self, name) is None})
+        vars(self).update({name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for setting in fields(self):
             self._check(setting.name, str(setting.type), setting.metadata)
         if self.referent == DRAWN and self.suite != STRICT:
@@ -231,14 +227,14 @@ class EnvSettings:
             self._require(LIBERO_ONLY, f"suite={self.suite}, without checkpoints, prompts, expert and object slots,")
         self._check_images()
         if self.suite == STRICT:
-            self._set(referent=DRAWN)
+            vars(self).update(referent=DRAWN)
         elif self.difficulty != STANDARD:
             raise MemobenchError(
                 f"difficulty={self.difficulty} is for strict tasks; set suite={STRICT}, or leave it out"
             )
         if self.rules == UPSTREAM:
             self._require(UPSTREAM_ONLY, f"rules={UPSTREAM}, the authors' evaluation,")
-            self._set(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
+            vars(self).update(demonstration_prompt=False, horizon=min(self.horizon, UPSTREAM_HORIZON))
         if self.evidence and self.referent == REFERENTS[0]:
             raise MemobenchError(
                 f"evidence=true runs each scene with each variant, but referent={self.referent} allows the published "
@@ -313,18 +309,12 @@ class EnvSettings:
             check_choice(name, value, accepted["values"])
 
     def _require(self, names: Sequence[str], reason: str) -> None:
-        """Raise unless settings have their default."""
-        defaults = {setting.name: setting.default for setting in fields(self)}
-        for name in names:
-            if (value := getattr(self, name)) != defaults[name]:
-                default = str(defaults[name]).lower()
+        for name in names:  # a field's default is an attribute of the class
+            if (value := getattr(self, name)) != (default := getattr(type(self), name)):
                 raise MemobenchError(
-                    f"{name} is {str(value).lower()}, but {reason} requires {name}={default}; leave {name} out"
+                    f"{name} is {str(value).lower()}, but {reason} requires {name}={str(default).lower()}; leave "
+                    f"{name} out"
                 )
-
-    def _set(self, **values: Any) -> None:
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
 
     @property
     def usual(self) -> dict[str, Any]:
@@ -342,11 +332,7 @@ class EnvSettings:
         return self.interference * (PROMPT_HORIZON + self.horizon + 2)
 
     def changed(self, **changes: Any) -> EnvSettings:
-        """Return a copy with changed values.
-
-        Raises:
-            MemobenchError: a setting is unknown, or a value is not accepted.
-        """
+        """Return a copy with changed values; raise for an unknown setting or value."""
         known = [setting.name for setting in fields(self)]
         for name in changes:
             if name not in known:

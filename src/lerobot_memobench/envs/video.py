@@ -40,7 +40,7 @@ def _font(size: int) -> Font:
 
 
 def _fit(draw: ImageDraw.ImageDraw, text: str, size: int, width: int) -> tuple[str, Font]:
-    """Shrink a text until it fits; truncate it at the smallest size."""
+    # Shrink the text until it fits; truncate it at the smallest size.
     for points in range(size, 8, -1):
         if draw.textlength(text, font=_font(points)) <= width:
             return text, _font(points)
@@ -112,7 +112,7 @@ LAST_FRAMES = 20
 
 
 class _DiscardedError(Exception):
-    """Makes `draft_of` remove the draft."""
+    """Make `draft_of` remove the draft."""
 
 
 class VideoRecorder:

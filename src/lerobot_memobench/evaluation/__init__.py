@@ -1,6 +1,6 @@
 """Results of evaluations: log -> metrics -> comparison -> documents.
 
-`records` reads evaluations, `metrics` counts. `comparison` pairs two evaluations and tests their difference
-(`statistics`); `controls` and `evidence` are controls of memory. `tables` defines tables and their formats, `report`
-assembles them after a first line of `headline`; `plots` draws, `html` writes the page for the browser.
+`records` reads evaluations and writes their headline, `metrics` counts. `comparison` pairs two evaluations, also as a
+control of memory, and `statistics` tests their contrasts; `evidence` is a control within one evaluation. `tables`
+defines tables and their formats, `report` assembles them; `plots` draws, `html` writes the page for the browser.
 """

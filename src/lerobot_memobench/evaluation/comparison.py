@@ -1,54 +1,26 @@
 """Two evaluations of the same episodes, compared pair by pair: rates, differences with intervals, and tests.
 
-Episodes are paired by task, number and referent. Rates are fractions. Evaluations that differ in the setting of a
-control (`controls`) are that control: the setting may differ, and the report explains the difference.
+Episodes are paired by task, number and referent. Rates are fractions. Evaluations that differ on purpose in the setting
+of a control of memory (`CONTROLS`) are that control: the setting may differ, and the report explains the difference.
+Other controls are evidence, which needs one evaluation (`evidence`), and granularity (`report`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations as ordered
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
-from lerobot_memobench.envs.settings import SETTINGS
+from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, POLICY, differences
+from lerobot_memobench.envs.settings import INTACT, SETTINGS
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
-from lerobot_memobench.evaluation.controls import Control, control_between, oracle_share
-from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.metrics import (
-    MEMORY_TYPE,
-    METRICS,
-    PROCESS_METRICS,
-    SUITE,
-    Record,
-    by_task,
-    inputs_phrase,
-    operations,
-    percent,
-    prefix,
-    rollout_value,
-    satisfied,
-    varies,
-)
-from lerobot_memobench.evaluation.records import SCENES, Run, other_draws, other_hashes, other_physics
-from lerobot_memobench.evaluation.statistics import (
-    DRAWS,
-    PERMUTATIONS,
-    Array,
-    Estimate,
-    detectable,
-    difference_interval,
-    holm,
-    interval_of,
-    mcnemar,
-    newcombe,
-    sign_flip,
-)
+from lerobot_memobench.evaluation.metrics import MEMORY_TYPE, SUITE, Record, inputs_phrase, operations, percent
+from lerobot_memobench.evaluation.records import SCENES, Run, headline, other_draws, other_hashes, other_physics
+from lerobot_memobench.evaluation.statistics import PERMUTATIONS, Contrast, Estimate, Kind, Pair, contrasts_of
 from lerobot_memobench.evaluation.tables import (
     NOT_APPLICABLE,
     Cell,
@@ -57,18 +29,140 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    csv_text,
     percent_text,
     with_ids,
 )
-from lerobot_memobench.tasks.catalogue import GROUPS, get_task, suite_of
-from lerobot_memobench.tasks.libero_suites import libero_id
-from lerobot_memobench.tasks.task import LIBERO_SUITES, SUITES
+from lerobot_memobench.tasks.catalogue import libero_id
 
 ALLOWED = (*(name for name in SETTINGS if name != "suite"), SCENES)
 """Settings that may differ when `allow` names them."""
 
-Pair = tuple[Record, Record]
+
+# --- controls ---
+
+
+@dataclass(frozen=True)
+class Control:
+    """A setting in which two evaluations differ on purpose.
+
+    Attributes:
+        setting: key of the protocol, or of the policy's settings where ``of_policy``.
+        default: its value in the first evaluation; the second has another.
+        meaning: how to read the difference.
+        one_policy: whether both evaluations have to be of one policy.
+        gap_closed: whether `oracle_share` is reported.
+        by_checkpoint: whether prefix completion is compared checkpoint by checkpoint.
+        value: the setting's only value that is the control; None: every value but the default.
+        also: other settings of the control, which may differ as well.
+    """
+
+    title: str
+    setting: str
+    default: Any
+    meaning: str
+    of_policy: bool = False
+    one_policy: bool = False
+    gap_closed: bool = False
+    by_checkpoint: bool = False
+    value: Any = None
+    also: tuple[str, ...] = ()
+
+    def value_in(self, run: Run) -> Any:
+        """Return the setting's value in an evaluation, the default where its log does not record it."""
+        known = run.protocol[POLICY].get("settings", {}) if self.of_policy else run.protocol
+        value = known.get(self.setting, self.default)
+        return value if self.value in (None, value) else self.default
+
+
+CONTROLS = (
+    Control(
+        "Pauses",
+        "pause_steps",
+        0,
+        "The robot rests at times that the seed draws. The policy observes and does the same, only later. A policy "
+        "that reads a clock loses; a policy that remembers events does not.",
+        one_policy=True,
+    ),
+    Control(
+        "Slower actions",
+        "speed",
+        1.0,
+        "Each action takes longer, so all events happen later. A policy that reads a clock loses; a policy that "
+        "remembers events loses no more than the expert.",
+        one_policy=True,
+    ),
+    Control(
+        "Corrupted memory",
+        "corrupt",
+        INTACT,
+        "The memory of the second evaluation's policy was deleted, swapped or made noisy once, at corrupt_step. "
+        "Metrics that do not fall do not depend on the memory before that step. With reshow the evidence was shown "
+        "again: a policy that recovers falls less than without it.",
+        one_policy=True,
+        also=("corrupt_step", "reshow"),
+    ),
+    Control(
+        "Prompt shown again",
+        "reshow",
+        False,
+        "The demonstration prompt plays twice in the second evaluation. After a corruption of the memory, a gain is "
+        "the policy's recovery; without one, a change is the effect of the longer prompt alone.",
+        one_policy=True,
+    ),
+    Control(
+        "Interference",
+        "interference",
+        0,
+        "In the second evaluation the policy observes episodes of other tasks between prompt and execution, without "
+        "a reset. A memory of the latest frames loses the prompt; a memory that selects by the task keeps it.",
+        one_policy=True,
+    ),
+    Control(
+        "Oracle memory",
+        "oracle_memory",
+        False,
+        "The second policy reads the true memory content. Gap closed is (second − first) / (100 − first): the share "
+        "that a perfect memory would recover. It is left out where the gap is under one point.",
+        gap_closed=True,
+    ),
+    Control(
+        "Shuffled memory",
+        "align_targets",
+        "subgoals",
+        "The second policy was trained on subgoals in another order; tasks with fewer than three such subgoals on "
+        "subgoals of other episodes. c1, c2, … count rollouts in which that checkpoint and all before it were "
+        "satisfied.",
+        of_policy=True,
+        by_checkpoint=True,
+        value="shuffled",
+    ),
+)
+
+
+def control_between(a: Run, b: Run) -> Control | None:
+    """Return the control that two evaluations are, None where none of `CONTROLS` differs.
+
+    Raises:
+        MemobenchError: the evaluation with the control comes first, or they are of two policies.
+    """
+    for control in CONTROLS:
+        first, second = control.value_in(a), control.value_in(b)
+        if first == second:
+            continue
+        if first != control.default:
+            raise MemobenchError(
+                f"{a.folder} was evaluated with {control.setting}={first} and {b.folder} with {control.setting}="
+                f"{second}; expected the evaluation with {control.setting}={control.default} first: exchange them"
+            )
+        for key in ("type", "sha256") if control.one_policy else ():
+            of_a, of_b = (run.protocol[POLICY].get(key) for run in (a, b))
+            if of_a and of_b and of_a != of_b:
+                raise MemobenchError(
+                    f"{a.folder} and {b.folder} are of two policies ({key} {str(of_a)[:12]} and {str(of_b)[:12]}); "
+                    "expected one policy with and without the control"
+                )
+        return control
+    return None
 
 
 # --- pairs of rollouts ---
@@ -98,8 +192,7 @@ def _paired(a: Run, b: Run, allow: Collection[str]) -> list[Pair]:
 
 
 def _common_episodes(a: Run, b: Run) -> list[Pair]:
-    """Return the rollouts of the same task and number; under different salts, of the same variant too."""
-    redrawn = other_draws(a, b)
+    redrawn = other_draws(a, b)  # another salt gives an episode another variant
 
     def key(record: Record) -> tuple[str, int, int | None]:
         return record["task"], record["episode"], record.get("variant") if redrawn else None
@@ -153,48 +246,6 @@ def _notes(a: Run, b: Run, pairs: Sequence[Pair], control: Control | None) -> li
 
 # --- comparison ---
 
-Kind = Literal["average", "memory type", "suite", "task", "family"]
-
-
-@dataclass(frozen=True)
-class Contrast:
-    """One metric of B against A over the same episodes. Rates are fractions.
-
-    Attributes:
-        kind: of the scope.
-        scope: the average, a memory type or suite of LIBERO, a task, or a family of tasks.
-        metric: SR, MSR, MUR or MCR; of a task also c1, c2, …, prefix completion.
-        n: pairs.
-        a, b: rates of both evaluations.
-        interval: 95 % interval of b − a.
-        p: exact McNemar for outcomes of yes or no, sign-flip permutation else.
-        exact: whether every assignment of signs was tried.
-        detectable: smallest true difference that so many pairs show with 80 % power at 5 %; None for above 1.
-        only_a, only_b: pairs in which only one of both succeeded (SR and prefix completion only).
-        adjusted: p after Holm over the tasks, None but for tasks.
-        closed: share of the first's gap to 1 that the second closes; None where the comparison does not ask for it.
-    """
-
-    kind: Kind
-    scope: str
-    metric: str
-    n: int
-    a: float
-    b: float
-    interval: tuple[float, float]
-    p: float
-    exact: bool
-    detectable: float | None
-    only_a: int | None = None
-    only_b: int | None = None
-    adjusted: float | None = None
-    closed: Estimate | None = None
-
-    @property
-    def value(self) -> float:
-        """The second rate minus the first."""
-        return self.b - self.a
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -202,7 +253,6 @@ class Comparison:
 
     Attributes:
         runs: both, with these episodes alone.
-        notes: warnings for the reader.
         control: the control that they are, if any.
     """
 
@@ -234,7 +284,7 @@ def compare_evaluations(
     """Compare two evaluations over the episodes that both hold.
 
     Args:
-        allow: settings of the protocol (or "scene_hash") that are meant to differ; a control's setting always may.
+        allow: settings, of `ALLOWED`, that are meant to differ; a control's setting always may.
         seed: of the random signs.
 
     Raises:
@@ -245,7 +295,8 @@ def compare_evaluations(
     if other_hashes(a.protocol, b.protocol):
         allowed.add(SCENES)
     pairs = _paired(a, b, allowed)
-    contrasts = _contrasts(pairs, control, np.random.default_rng(seed), permutations)
+    reported = {} if control is None else {"by_checkpoint": control.by_checkpoint, "closes": control.gap_closed}
+    contrasts = contrasts_of(pairs, np.random.default_rng(seed), permutations, **reported)
     first, second = (replace(run, records=[pair[k] for pair in pairs]) for k, run in enumerate((a, b)))
     return Comparison((first, second), contrasts, _notes(a, b, pairs, control), control)
 
@@ -256,146 +307,6 @@ def controls_among(runs: Sequence[Run]) -> Iterator[Comparison]:
         with suppress(MemobenchError):  # reversed, of two policies, or of other protocols: no control
             if control_between(a, b) is not None:
                 yield compare_evaluations(a, b)
-
-
-# --- tasks and scopes ---
-
-
-class _Sample(NamedTuple):
-    """A metric in the pairs of a task, (n, 2) in [0, 1], and its mean in each bootstrap draw, (`DRAWS`, 2)."""
-
-    values: Array
-    drawn: Array
-
-
-class _Task(NamedTuple):
-    name: str
-    memory_type: str
-    family: str | None
-    samples: Mapping[str, _Sample]
-
-
-def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
-    partners = {id(first): second for first, second in pairs}
-    rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
-    tasks = []
-    for name, group in by_task(first for first, _ in pairs).items():
-        both = [(record, partners[id(record)]) for record in group]
-        values = {
-            metric: np.array([[rollout_value(r, metric) for r in pair] for pair in both], float) for metric in METRICS
-        }
-        if by_checkpoint:
-            reached = np.array([[prefix(satisfied(record)) for record in pair] for pair in both], dtype=float)
-            values |= {f"c{k + 1}": reached[:, :, k] for k in range(reached.shape[2])}
-        scenes = _scenes(group)  # rollouts of one scene depend on each other, so they are drawn together
-        drawn = scenes[rng.integers(len(scenes), size=(DRAWS, len(scenes)))].reshape(DRAWS, -1)
-        samples = {
-            metric: _Sample(value, value[drawn].mean(axis=1))
-            for metric, value in values.items()
-            if not np.isnan(value).any()  # does not apply
-        }
-        family = get_task(name).family if suite_of(name) in SUITES else None
-        tasks.append(_Task(name, str(group[0]["memory_type"]), family, samples))
-    return tasks
-
-
-def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
-    """Return the rollouts of each scene of a task by their index, (S, V): V is 1 unless each scene has V variants."""
-    scenes: dict[Any, list[int]] = {}
-    for k, record in enumerate(group):
-        scenes.setdefault(record.get("seed") if varies(record) else (k,), []).append(k)
-    whole = len({len(scene) for scene in scenes.values()}) == 1
-    return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
-
-
-def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]:
-    """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups.
-
-    Of a single suite of LIBERO, the average is that of the suite. LIBERO's tasks have no families.
-    """
-    types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
-    families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}
-    types = [group for group in types if group]
-    kind: Kind = SUITE if tasks[0].memory_type in LIBERO_SUITES else MEMORY_TYPE
-    alone = kind == SUITE and len(types) == 1
-    return [
-        ("average", tasks[0].memory_type if alone else f"average of {kind}s", types),
-        *((kind, group[0].memory_type, [group]) for group in types if not alone),
-        *(("task", task.name, [[task]]) for task in tasks),
-        *(("family", str(name), [group]) for name, group in families.items()),
-    ]
-
-
-# --- one metric in one scope ---
-
-
-def _contrasts(
-    pairs: Sequence[Pair], control: Control | None, rng: np.random.Generator, permutations: int
-) -> list[Contrast]:
-    closes = control is not None and control.gap_closed
-    contrasts = []
-    for kind, scope, groups in _scopes(_tasks(pairs, by_checkpoint=control is not None and control.by_checkpoint)):
-        for metric in groups[0][0].samples if kind == "task" else METRICS:
-            samples = [[task.samples[metric] for task in group if metric in task.samples] for group in groups]
-            if applicable := [group for group in samples if group]:
-                contrasts.append(_contrast((kind, scope), metric, applicable, rng, permutations, closes))
-    for metric in METRICS:
-        of_tasks = [k for k, contrast in enumerate(contrasts) if contrast.metric == metric and contrast.kind == "task"]
-        for k, p in zip(of_tasks, holm([contrasts[k].p for k in of_tasks]), strict=True):
-            contrasts[k] = replace(contrasts[k], adjusted=p)
-    return contrasts
-
-
-def _contrast(
-    scope: tuple[Kind, str],
-    metric: str,
-    groups: list[list[_Sample]],
-    rng: np.random.Generator,
-    permutations: int,
-    closes: bool,
-) -> Contrast:
-    values = [sample.values for group in groups for sample in group]
-    sizes = [len(groups) * len(group) * len(sample.values) for group in groups for sample in group]
-    before, after = np.concatenate(values).T
-    weights = np.concatenate([np.full(len(value), 1 / size) for value, size in zip(values, sizes, strict=True)])
-    drawn = np.mean([np.mean([sample.drawn for sample in group], axis=0) for group in groups], axis=0)
-    # Summed as the report sums, so that both print the same digits.
-    a, b = (_mean([_mean([_mean(s.values[:, k].tolist()) for s in group]) for group in groups]) for k in (0, 1))
-    d = after - before
-    only_a = only_b = None
-    if metric in PROCESS_METRICS:
-        p, exact = sign_flip(d, weights, rng, permutations)
-    else:
-        only_a, only_b, exact = int(np.sum(d < 0)), int(np.sum(d > 0)), True
-        p = mcnemar(only_a, only_b)
-    return Contrast(
-        *scope,
-        metric=metric,
-        n=len(d),
-        a=a,
-        b=b,
-        interval=difference_interval(drawn[:, 1] - drawn[:, 0], before, after, weights),
-        p=p,
-        exact=exact,
-        detectable=detectable(d, weights),
-        only_a=only_a,
-        only_b=only_b,
-        closed=_closed(a, b, drawn, newcombe(before, after, weights)) if closes else None,
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-def _closed(a: float, b: float, drawn: Array, bounds: tuple[float, float]) -> Estimate:
-    """Return the share of the gap that is closed, with its interval where the gap seldom vanishes in the draws."""
-    value = oracle_share(a, b)
-    shares = [share for pair in drawn.tolist() if (share := oracle_share(*pair)) is not None]
-    if value is None or len(shares) <= 0.9 * len(drawn):
-        return Estimate(value)
-    low, high = interval_of(np.array(shares), (bounds[0] / (1.0 - a), bounds[1] / (1.0 - a)))
-    return Estimate(value, low, min(high, 1.0))
 
 
 # --- the report ---
@@ -414,47 +325,33 @@ TABLES: tuple[tuple[str, str, tuple[Kind, ...]], ...] = (
 """Key, title, and kinds of scopes of each table."""
 
 
-def comparison_report(comparison: Comparison) -> Report:
-    """Return a comparison as tables and JSON values."""
-    section = comparison_section(comparison)
-    title = f"{section.title}: {headline(comparison.runs)}"
-    return Report(title, [replace(section, title="")], comparison_data(comparison))
-
-
-def comparison_section(comparison: Comparison, overall: bool = False) -> Section:
-    """Return the tables of a comparison, with a title; ``overall`` leaves tasks and families out."""
+def comparison_report(comparison: Comparison, overall: bool = False) -> Report:
+    """Return a comparison as tables and JSON values; ``overall`` leaves tasks and families out."""
+    shown = TABLES[: 1 if overall else None]
     kinds = {contrast.kind for contrast in comparison.contrasts}
-    tables = [_table(comparison, *spec) for spec in TABLES[: 1 if overall else None] if kinds & {*spec[2]}]
+    tables = [_table(comparison, *spec) for spec in shown if kinds & {*spec[2]}]
     if MEMORY_TYPE not in kinds:
         tables[0] = replace(tables[0], title="Average and suites" if SUITE in kinds else "Suite")
     sentence = f"{count_of(comparison.pairs, 'episode')} in both, paired by task, episode and referent."
     meaning = [comparison.control.meaning] if comparison.control else []
-    return Section(comparison.title, tables, [sentence, *meaning, NOTE], comparison.notes)
-
-
-def comparison_data(comparison: Comparison, overall: bool = False) -> dict[str, Any]:
-    """Return a comparison as JSON values; ``overall`` leaves tasks and families out."""
-    kinds = [kind for _, _, kinds in TABLES[: 1 if overall else None] for kind in kinds]
-    return {
+    title = comparison.title if overall else ""
+    section = Section(title, tables, [sentence, *meaning, NOTE], comparison.notes)
+    data = {
         "a": comparison.runs[0].name,
         "b": comparison.runs[1].name,
         "control": comparison.control.setting if comparison.control else None,
         "inputs": comparison.inputs,
         "pairs": comparison.pairs,
-        "differences": [_entry(row) for row in comparison.contrasts if row.kind in kinds],
+        "differences": [_entry(row) for row in comparison.contrasts if any(row.kind in spec[2] for spec in shown)],
         "notes": list(comparison.notes),
     }
+    return Report(f"{comparison.title}: {headline(comparison.runs)}", [section], data)
 
 
 def comparison_phrase(comparison: Comparison) -> str:
     """Return the change of the average success in words, for one line."""
     success = comparison.contrasts[0]
     return f"{comparison.title}: SR {_points(success.value, True)} {_interval(success)}"
-
-
-def comparison_csv(comparison: Comparison) -> str:
-    """Return all differences of a comparison as CSV, one a row."""
-    return csv_text([_entry(row) for row in comparison.contrasts])
 
 
 def _table(comparison: Comparison, key: str, title: str, kinds: Collection[Kind]) -> Table:
@@ -506,8 +403,10 @@ def _p(value: float | None) -> Numbers:
 
 def _entry(row: Contrast) -> dict[str, Any]:
     """Return a difference as JSON values; rates in per cent, p as they are."""
-    number = libero_id(row.scope)
-    entry = {
+    number, closed = libero_id(row.scope), {}
+    if row.closed is not None:
+        closed = {"gap_closed": row.closed.value, "gap_closed_low": row.closed.low, "gap_closed_high": row.closed.high}
+    return {
         "kind": row.kind,
         "scope": row.scope,
         **({} if number is None else {"id": number}),
@@ -525,8 +424,5 @@ def _entry(row: Contrast) -> dict[str, Any]:
         "p": row.p,
         "p_holm": row.adjusted,
         "detectable": None if row.detectable is None else round(100 * row.detectable, 2),
+        **{name: percent(value) for name, value in closed.items()},
     }
-    if row.closed is None:
-        return entry
-    closed = {"gap_closed": row.closed.value, "gap_closed_low": row.closed.low, "gap_closed_high": row.closed.high}
-    return {**entry, **{name: percent(value) for name, value in closed.items()}}

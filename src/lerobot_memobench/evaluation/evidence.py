@@ -1,7 +1,7 @@
 """Evidence: share of choices that follow the past, where each scene was run with each variant of its task.
 
 A policy without the past that cannot look before it chooses gives the same answer in all variants of a scene. Its rate
-of right answers is the chance (`tasks.evidence.chance`), for any scenes. The terms *warranted choice* and *reliable
+of right answers is the chance (`tasks.assessment.chance`), for any scenes. The terms *warranted choice* and *reliable
 pair* are those of the Counterfactual Memory Audit (arXiv 2609.27247).
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.metrics import Record, by_task, percent, varies, wilson
-from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, interval_of
+from lerobot_memobench.evaluation.statistics import DRAWS, Array, Estimate, interval_of, nested_mean
 from lerobot_memobench.evaluation.tables import Cell, Name, Numbers, Section, Table, percent_text, with_interval
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import DIFFICULTIES
@@ -29,8 +29,7 @@ RIGHT, RELIABLE = "right", "reliable"
 """Share of the evidence's among the answers given; share of pairs of variants of a scene that were both followed."""
 SHOWN = {name: name for name in RATES[:3]} | {RIGHT: "right, of the decided", RELIABLE: "reliable pairs"}
 """Columns of the tables: rate -> title."""
-ENOUGH = 35
-"""Effective number of scenes from which on the interval of a perfect policy begins at 90 %."""
+ENOUGH = 35  # effective scenes from which on the interval of a perfect policy begins at 90 %
 SENTENCE = (
     "Each scene was run with each variant of its task, so only the past differs. Follows: the answer, by the first "
     "object lifted or joint moved, is the one that the evidence asks for; right, of the decided: among rollouts with "
@@ -62,12 +61,7 @@ class Evidence:
 
 
 class EvidenceRates(NamedTuple):
-    """The rates of an evaluation.
-
-    Attributes:
-        average: mean over memory types, None where no task has a chance.
-        notes: warnings for the reader.
-    """
+    """The rates of an evaluation; the average is the mean over memory types, None where no task has a chance."""
 
     tasks: dict[str, Evidence]
     memory_types: dict[str, Evidence]
@@ -86,10 +80,7 @@ class _Task(NamedTuple):
 
 
 def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
-    """Return how often choices follow the evidence; scenes that were not run with every variant are left out.
-
-    None unless scenes of a task were run with several variants.
-    """
+    """Return how often choices follow the evidence, None unless scenes of a task were run with several variants."""
     groups = _by_task(records)
     if not groups:
         return None
@@ -98,7 +89,10 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
     types: dict[str, list[_Task]] = {}
     left_out, without_rate = 0, list[str]()
     for name, group in groups.items():
-        whole = _whole_scenes(group)
+        scenes: dict[int, dict[int, Record]] = {}
+        for record in group:
+            scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
+        whole = [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
         left_out += len(group) - sum(map(len, whole))
         if not whole:
             without_rate.append(name)
@@ -131,13 +125,6 @@ def _by_task(records: Iterable[Record]) -> dict[str, list[Record]]:
     return by_task(record for record in records if "choice" in record and varies(record))
 
 
-def _whole_scenes(group: Sequence[Record]) -> list[list[Record]]:
-    scenes: dict[int, dict[int, Record]] = {}
-    for record in group:
-        scenes.setdefault(record.get("seed") or 0, {})[record.get("variant") or 0] = record
-    return [list(scene.values()) for scene in scenes.values() if len(scene) == int(group[0]["variants"])]
-
-
 def _rates_of_scene(scene: Sequence[Record]) -> list[float]:
     right = np.array([record["choice"] == record.get("variant") for record in scene])
     answered = np.array([bool(record.get("answered", record["choice"] is not None)) for record in scene])
@@ -156,6 +143,7 @@ def _permuted(scene: Sequence[Record], rng: np.random.Generator) -> Array:
         groups.setdefault(instruction.get(record.get("variant") or 0), []).append(record)
     for group in groups.values():
         shown = np.array([goal.get(k := record.get("variant") or 0, k) for record in group])
+        # -1, no answer, is no variant.
         chosen = np.array([-1 if (k := record["choice"]) is None else goal.get(k, k) for record in group])
         right += (rng.permuted(np.tile(chosen, (DRAWS, 1)), axis=1) == shown).sum(axis=1)
     return right / len(scene)
@@ -179,12 +167,9 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     """Return the mean over groups of the means over their tasks, with intervals over scenes."""
 
-    def mean(values: Sequence[Sequence[Any]]) -> Any:
-        return np.mean([np.mean(group, axis=0) for group in values], axis=0)
-
     tasks = [task for group in groups for task in group]
-    rates = mean([[task.values.mean(axis=0) for task in group] for group in groups])
-    drawn = mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
+    rates = nested_mean([[task.values.mean(axis=0) for task in group] for group in groups])
+    drawn = nested_mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
     weights = [1 / (len(groups) * len(group) * len(task.values)) for group in groups for task in group]
     scenes = max(1.0, 1 / sum(len(task.values) * weight**2 for task, weight in zip(tasks, weights, strict=True)))
     estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate((*RATES, RELIABLE))}
@@ -194,14 +179,14 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
         estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1
     chances = [[task.chance for task in group] for group in groups]
-    permuted = mean([[task.permuted for task in group] for group in groups])
+    permuted = nested_mean([[task.permuted for task in group] for group in groups])
     return Evidence(
         # Equal means of other orders of addition may differ in their last bits.
         p=(1 + int((permuted >= rates[0] - 1e-9).sum())) / (1 + len(permuted)),
         effective=scenes,
         scenes=sum(len(task.values) for task in tasks),
         variants=tasks[0].variants if alone else None,
-        chance=tasks[0].chance if alone else float(mean(chances)),
+        chance=tasks[0].chance if alone else float(nested_mean(chances)),
         rates=estimates,
     )
 
@@ -215,7 +200,7 @@ def _estimate(rate: float, drawn: Array, scenes: float) -> Estimate:
 
 
 def evidence_section(evidence: EvidenceRates) -> Section:
-    """Return the tables of an evaluation in which each scene was run with each variant."""
+    """Return the tables of the rates."""
     header = ("scenes", "chance", *SHOWN.values(), "p")
     rows = [_row(name, rates) for name, rates in evidence.memory_types.items()]
     of_tasks = [_row(Name(name), rates) for name, rates in evidence.tasks.items()]
@@ -233,7 +218,7 @@ def _row(name: str, evidence: Evidence) -> tuple[Cell, ...]:
 
 
 def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[str, Any]:
-    """Return the rates as JSON values, per cent, and of each task which variant was chosen how often."""
+    """Return the rates as JSON values, per cent, and how often each variant of a task was chosen."""
     groups = _by_task(records)
     return {
         "average": None if evidence.average is None else _data(evidence.average),
@@ -243,7 +228,7 @@ def evidence_data(evidence: EvidenceRates, records: Sequence[Record]) -> dict[st
 
 
 def _choices(group: Sequence[Record]) -> dict[str, dict[str, int]]:
-    """Return variant that was asked for -> variant that was chosen, or "none" -> rollouts."""
+    """Return variant of the scene -> chosen variant, or "none" -> rollouts."""
     choices: dict[str, Counter[str]] = {}
     for record in group:
         chosen = "none" if record["choice"] is None else str(record["choice"])

@@ -29,26 +29,15 @@ from lerobot_memobench.envs.video import LAST_FRAMES, OPERATION_COLOURS
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.comparison import comparison_phrase, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_phrase
-from lerobot_memobench.evaluation.headline import headline
-from lerobot_memobench.evaluation.metrics import (
-    SUITE,
-    Rate,
-    Record,
-    Row,
-    by_task,
-    failure_of,
-    operations,
-    percent,
-)
-from lerobot_memobench.evaluation.records import Run, read_runs, unlike
+from lerobot_memobench.evaluation.metrics import SUITE, Rate, Record, Row, by_task, failure_of, operations, percent
+from lerobot_memobench.evaluation.records import Run, headline, read_runs, unlike
 from lerobot_memobench.evaluation.report import evaluation_report, outcomes
 from lerobot_memobench.evaluation.tables import OPERATION_NAMES, csv_tables
 from lerobot_memobench.io import draft_of, file_name, refuse_links, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.policies.memory_reads import Chunk, find_reads
-from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, load_task, suite_of
+from lerobot_memobench.tasks.catalogue import GROUPS, find_tasks, get_task, libero_id, load_task, suite_of
 from lerobot_memobench.tasks.formula import format_formula
-from lerobot_memobench.tasks.libero_suites import libero_id
 from lerobot_memobench.tasks.task import LEVELS, Task
 
 PAGE = "index.html"
@@ -58,8 +47,7 @@ SCRIPTS = (
     *("pair", "main"),
 )
 """Parts of the one script, in ``script/``; a later part uses earlier ones."""
-MARK = "memobench html"
-"""Value of the page's ``generator``, by which a folder is recognised as a report."""
+MARK = "memobench html"  # value of the page's ``generator``, by which a folder is recognised as a report
 UNFINISHED = f'''<!doctype html><meta charset="utf-8"><meta name="generator" content="{MARK}"><title>Unfinished</title>
 <p>This report was not finished; run <code>memobench report --html</code> again.'''
 
@@ -167,10 +155,7 @@ def _remove_other_videos(out: Path, placed: Collection[Path]) -> list[str]:
 
 
 def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path], list[str]]:
-    """Return position of a rollout in ``records`` -> its video, and a note on videos that do not fit theirs.
-
-    A video counts only when it is as long as its rollout: a timeline under another rollout's video would mislead.
-    """
+    """Return position of a rollout in ``records`` -> its video, and a note on videos that do not fit theirs."""
     videos: dict[int, Path] = {}
     misfits: list[str] = []
     for k, record in enumerate(records):
@@ -178,21 +163,18 @@ def find_videos(folder: Path, records: Sequence[Record]) -> tuple[dict[int, Path
             file_name(episode_id(record), "a rollout's name")
             video = folder / VIDEOS / f"{record['task']}.{record['episode']}.mp4"
             if video.is_file():
-                if _fits(frame_count(video), record):
-                    videos[k] = video
-                else:
+                # A timeline under another rollout's video would mislead. A video has a frame of the start, one per
+                # control step, and the last one held.
+                frames, steps = frame_count(video), record.get("steps")
+                whole = int(record.get("prompt_steps") or 0) + int(steps or 0) + LAST_FRAMES + 1
+                if frames is None or (steps is not None and frames != whole):
                     misfits.append(video.name)
+                else:
+                    videos[k] = video
     if not misfits:
         return videos, []
     listed = ", ".join(misfits[:3]) + (f" and {len(misfits) - 3} more" if len(misfits) > 3 else "")
     return videos, [f"Videos that do not clearly belong to a logged rollout were left out: {listed}."]
-
-
-def _fits(frames: int | None, record: Record) -> bool:
-    """Return whether a video has a frame of the start, one per control step, and its last one held."""
-    if frames is None or record.get("steps") is None:
-        return frames is not None
-    return frames == int(record.get("prompt_steps") or 0) + int(record["steps"]) + LAST_FRAMES + 1
 
 
 def frame_count(path: Path) -> int | None:
@@ -244,8 +226,8 @@ def page_data(
 
     Args:
         videos: per run, position of a rollout in its records -> address of its video, relative to the page.
-        reads: per run, position of a rollout -> memory reads of its chunks; None: not recorded.
         known: task name -> task, for language and checkpoint texts.
+        reads: per run, position of a rollout -> memory reads of its chunks; None: not recorded.
     """
     controls: dict[str, list[str]] = {run.name: [] for run in runs}
     for comparison in controls_among(runs):
@@ -330,14 +312,14 @@ def evaluation_on_page(
 
 
 def facts(run: Run) -> list[str]:
-    """Return the line below the first one: rollouts, their horizon, and how often choices follow the evidence."""
+    """Return the number of rollouts, their horizon, and how often choices follow the evidence."""
     horizons = dict.fromkeys(evaluation.protocol.get("horizon") for evaluation in run.evaluations)
     evidence = [] if run.evidence is None else evidence_phrase(run.evidence)
     return [count_of(len(run.records), "rollout"), *(f"horizon {steps}" for steps in horizons if steps), *evidence]
 
 
 def row_data(row: Row) -> dict[str, Any]:
-    """Return metric -> rate as `rate_data` writes it."""
+    """Return metric -> `rate_data`."""
     return {metric: rate_data(rate) for metric, rate in row.items()}
 
 
@@ -350,11 +332,7 @@ def rate_data(rate: Rate) -> list[float | int | None] | None:
 
 
 def episode_data(record: Record, video: str | None, reads: Sequence[Chunk] = ()) -> dict[str, Any]:
-    """Return one rollout.
-
-    Checkpoints are [operation, first step, ordered step], execution steps counted from 1. Reads are [frame of the
-    timeline, entries, weights] of each chunk.
-    """
+    """Return one rollout. Execution steps count from 1; chunks of reads count frames of the timeline."""
     last = max([1, *(c["first_step"] for c in record["checkpoints"] if c["first_step"] is not None)])
     return {
         "id": episode_id(record),
@@ -403,10 +381,7 @@ def page(data: Mapping[str, Any], title: str) -> str:
 
 
 def inline_json(value: Any) -> str:
-    """Return JSON for the inside of ``<script type="application/json">``.
-
-    ``<``, ``>`` and ``&`` are escaped, so the text cannot end the element or open a comment.
-    """
+    """Return JSON for the inside of ``<script type="application/json">``, which no text can end."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 

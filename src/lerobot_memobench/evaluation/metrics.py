@@ -15,9 +15,8 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from lerobot_memobench.errors import MemobenchError, count_of, nearest
-from lerobot_memobench.tasks.catalogue import GROUPS, suite_of
-from lerobot_memobench.tasks.failures import FAILURES, FAULTS, REFINED_FAILURES, classify
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.assessment import FAILURES, FAULTS, REFINED_FAILURES, classify
+from lerobot_memobench.tasks.catalogue import GROUPS, libero_id, suite_of
 from lerobot_memobench.tasks.task import LIBERO_SUITES, MEMORY_TYPES, PUBLISHED, STRICT_FAILURES
 
 Record = Mapping[str, Any]
@@ -114,7 +113,7 @@ def notes_on(records: Sequence[Record]) -> list[str]:
 
 
 def faults(records: Iterable[Record]) -> list[str]:
-    """Return a sentence for each task with rollouts that were broken off, and so failed, with the first reason."""
+    """Return a sentence for each task with rollouts that were broken off, and so failed."""
     notes = []
     for task, group in by_task(record for record in records if record.get("fault")).items():
         were, count = ("was", "counts") if len(group) == 1 else ("were", "count")
@@ -180,11 +179,8 @@ Row = dict[str, Rate]
 
 
 def wilson(rate: float, n: float) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a rate over ``n`` trials, within [0, 1].
-
-    Written out although SciPy has it: every report and every evaluation's end needs it, and importing SciPy's
-    statistics takes longer than all the rest of a report.
-    """
+    """Return the 95 % Wilson score interval of a rate over ``n`` trials, within [0, 1]."""
+    # Not SciPy's: every evaluation ends with a report, and importing SciPy's statistics takes longer than the report.
     if n < 1 or not 0.0 <= rate <= 1.0:
         raise MemobenchError(f"a Wilson interval needs a rate in [0, 1] over at least one trial, got {rate} over {n}")
     z = Z95
@@ -203,11 +199,9 @@ def percent(value: float | None) -> float | None:
 
 
 class Metric(NamedTuple):
-    """A metric: the share of outcomes that are true; higher is better.
+    """A metric: the share of a rollout's outcomes that are true, [] where it does not apply; higher is better.
 
-    Attributes:
-        title: one word for the axis of a figure.
-        outcomes: rollout -> its outcomes, [] where the metric does not apply.
+    ``title`` is a word for the axis of a figure.
     """
 
     title: str
@@ -235,7 +229,10 @@ PROCESS_METRICS = tuple(METRICS)[1:]
 
 def task_row(records: Sequence[Record]) -> Row:
     """Return the metrics of one task's rollouts: the mean over rollouts of the mean over a rollout's outcomes."""
-    pooled, scenes = pooled_row(records), _scenes(records)
+    pooled, scenes = pooled_row(records), None
+    if any(map(varies, records)):
+        # Rollouts of one scene depend on each other, by an unknown amount: the interval over scenes is the widest.
+        scenes = len({(record["task"], record.get("seed")) for record in records})
     return {metric: Rate(rate.value, len(records) if rate.n else 0, scenes) for metric, rate in pooled.items()}
 
 
@@ -258,21 +255,11 @@ def share(values: Sequence[bool]) -> Rate:
     return Rate(sum(values) / len(values) if values else None, len(values))
 
 
-def _scenes(records: Sequence[Record]) -> int | None:
-    """Return the number of scenes where scenes are run with several variants, None elsewhere.
-
-    Rollouts of one scene depend on each other. An interval over scenes is at least as wide as one that knows how much.
-    """
-    return len({(record["task"], record.get("seed")) for record in records}) if any(map(varies, records)) else None
-
-
 def _metrics(records: Sequence[Record]) -> Sequence[str]:
-    """Return the metrics of rollouts: SR alone of LIBERO's suites, which have no checkpoints."""
     return ("SR",) if any(record.get("memory_type") in LIBERO_SUITES for record in records) else tuple(METRICS)
 
 
 def _prefix_rates(group: Sequence[Record], reached: Callable[[Record], list[bool]]) -> list[Rate]:
-    """Return per checkpoint the rate of rollouts in which it and all earlier ones were reached, (K,)."""
     return [share(column) for column in zip(*(prefix(reached(record)) for record in group), strict=True)]
 
 
@@ -289,7 +276,7 @@ def mean_rate(rates: Iterable[Rate]) -> Rate:
     """Return the mean of the applicable rates, each of the same weight whatever its n.
 
     A mean of m rates over n₁ … n_m rollouts has the variance p(1 − p) · Σ 1/(m² n_i) where they share p, which is that
-    of a plain rate over m² / Σ 1/n_i rollouts. With equal n_i this is their sum.
+    of a plain rate over m² / Σ 1/n_i rollouts.
     """
     applicable = [rate for rate in rates if rate.value is not None]
     if not applicable:
@@ -303,20 +290,13 @@ def mean_rate(rates: Iterable[Rate]) -> Rate:
     return Rate(mean, n, None if math.isclose(effective, n) else effective)
 
 
-# --- failures; the rule itself is `tasks.failures` ---
+# --- failures; the rule itself is `tasks.assessment` ---
 
 _ALL = (*FAILURES, *REFINED_FAILURES, *STRICT_FAILURES, *FAULTS)
 
 
 def failure_of(record: Record) -> str | None:
-    """Return the failure class of a logged rollout, None for a success.
-
-    A log without the class gets it from its checkpoints. Drift cannot be derived from them, so it is then
-    never named.
-
-    Raises:
-        MemobenchError: the class is unknown, or a success has one.
-    """
+    """Return the failure class of a logged rollout, None for a success; raise for an unknown or contradicting class."""
     logged = record.get("failure")
     if record["success"]:
         if logged is not None:
@@ -325,7 +305,7 @@ def failure_of(record: Record) -> str | None:
                 "class: the log was changed or damaged, evaluate again"
             )
         return None
-    if logged is None:
+    if logged is None:  # a log of another tool: the checkpoints give the class, but never a drift
         checkpoints = record["checkpoints"]
         return classify([c["operation"] for c in checkpoints], [c["first_step"] for c in checkpoints], False)
     if logged not in _ALL:
@@ -336,11 +316,9 @@ def failure_of(record: Record) -> str | None:
 
 
 def failure_counts(records: Iterable[Record]) -> dict[str, int]:
-    """Return class -> number of failed rollouts, in the report's order: the paper's classes, others as found.
-
-    Of LIBERO's suites, only those that are found.
-    """
+    """Return class -> number of failed rollouts, in the report's order."""
     records = list(records)
+    # Reports list each of the paper's classes, but those of LIBERO's suites, which lack checkpoints, only those found.
     counts, always = Counter(map(failure_of, records)), FAILURES if len(_metrics(records)) > 1 else ()
     return {name: counts[name] for name in _ALL if name in always or counts[name]}
 
@@ -359,8 +337,8 @@ class TaskSummary:
 
     Attributes:
         operations: labels of the checkpoints, such as "SUU".
-        prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in any order.
-        ordered_prefix: the same in order.
+        prefix, ordered_prefix: per checkpoint the rate of rollouts in which it and all earlier ones were satisfied, in
+            any order and in order.
     """
 
     memory_type: str
@@ -379,8 +357,7 @@ class Summary:
         memory_types: name -> metrics, each the mean over its applicable tasks; a suite of LIBERO is one of them.
         average: mean over the applicable memory types.
         pooled: MSR, MUR, MCR over all checkpoint records of the operation, of all tasks; n counts records.
-        pooled_checkpoints: the same over all checkpoint records, of all operations.
-        failures: class -> number of failed rollouts.
+        pooled_checkpoints: the same over all operations.
         inputs: of the policy, in words.
     """
 

@@ -11,7 +11,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,8 +21,7 @@ from lerobot_memobench.evaluation.metrics import METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import Run, sweeps
 from lerobot_memobench.evaluation.report import outcomes
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.tasks.catalogue import get_task, suite_of
-from lerobot_memobench.tasks.gap import gaps
+from lerobot_memobench.tasks.catalogue import cue_to_use, get_task, suite_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,9 +68,8 @@ def line_style(number: int, published: bool) -> dict[str, Any]:
     return {"color": colour, "marker": _MARKERS[other], "ls": _DASHES[other], "mfc": face, "ms": 4}
 
 
-@contextmanager
-def paper_style() -> Iterator[None]:
-    """Set fonts and lines of everything drawn inside."""
+def paper_style() -> AbstractContextManager[None]:
+    """Return a context that sets fonts and lines of everything drawn inside."""
     import matplotlib as mpl
 
     settings = {
@@ -88,8 +86,7 @@ def paper_style() -> Iterator[None]:
         "hatch.linewidth": 0.4,
         "pdf.fonttype": 42,  # text stays text
     }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(settings)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -135,19 +132,12 @@ def draw_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
 
 # --- outcomes of rollouts ---
 
-NARROWEST_LABEL = 5.0
-"""Per cent; narrower parts of a bar have no room for a figure."""
-HEADING = 52
-"""Characters of a line left of a bar."""
+NARROWEST_LABEL = 5.0  # per cent; narrower parts of a bar have no room for a number
+HEADING = 52  # characters of a line left of a bar
 
 
 class Bar(NamedTuple):
-    """One bar.
-
-    Attributes:
-        heading: memory type, written left of the first bar of a group. name: of the evaluation, "" for a single one.
-        parts: outcome -> rollouts, from the left.
-    """
+    """The outcomes of an evaluation, outcome -> rollouts, under the heading of a group of bars."""
 
     heading: str
     name: str
@@ -217,7 +207,17 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
     from matplotlib.lines import Line2D
 
     metrics = [*runs[0].summary.average]
-    methods = {name: _curves(group) for name, group in sweeps(runs).items()}
+    methods = {
+        name: {
+            metric: {
+                run.replan_steps: rate
+                for run in group
+                if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
+            }
+            for metric in metrics
+        }
+        for name, group in sweeps(runs).items()
+    }
     styles = {name: line_style(number, published=False) for number, name in enumerate(methods)}
     with paper_style():
         figure = new_figure(1.25 + 1.55 * len(metrics), 2.5)
@@ -236,17 +236,6 @@ def draw_replan(runs: Sequence[Run]) -> Figure:
         return figure
 
 
-def _curves(runs: Sequence[Run]) -> dict[str, dict[int, Rate]]:
-    return {
-        metric: {
-            run.replan_steps: rate
-            for run in runs
-            if (rate := run.summary.average[metric]).value is not None and run.replan_steps is not None
-        }
-        for metric in runs[0].summary.average
-    }
-
-
 def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) -> None:
     values = [math.nan if rate.value is None else 100 * rate.value for rate in curve.values()]
     intervals = [rate.interval for rate in curve.values() if rate.interval is not None]
@@ -258,27 +247,28 @@ def _draw_curve(axis: Any, curve: Mapping[int, Rate], style: Mapping[str, Any]) 
 
 # --- success by gap ---
 
+# The first group needs no memory over time.
 EDGES = (0, 2, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
 GAPS = {f"{low}–{high - 1}": (low, high) for low, high in pairwise(EDGES)}
-"""Groups of gaps from cue to use (`tasks.gap`), control steps; the first group needs no memory over time."""
+"""Groups of gaps from cue to use (`catalogue.cue_to_use`), control steps."""
 
 
 def success_by_gap(records: Sequence[Record]) -> dict[str, tuple[int, int]]:
-    """Return for each group of gaps with checkpoints how many were reached, and how many there are.
-
-    A checkpoint counts if all earlier ones were reached in order: only then its information had to be remembered.
-    """
+    """Return for each group of gaps with checkpoints how many were reached, and how many there are."""
     samples = [sample for record in records for sample in _samples(record)]
     reached = {group: [done for gap, done in samples if low <= gap < high] for group, (low, high) in GAPS.items()}
     return {group: (sum(done), len(done)) for group, done in reached.items() if done}
 
 
 def _samples(record: Record) -> Iterator[tuple[int, bool]]:
-    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps."""
+    """Yield gap and success of the checkpoints that an episode came to; none for tasks without measured gaps.
+
+    Only where all earlier ones were reached in order, the information of a checkpoint had to be remembered.
+    """
     if suite_of(record["task"]) is None:
         return
     task = get_task(record["task"])
-    for gap, checkpoint in zip(gaps(task), record["checkpoints"], strict=False):
+    for gap, checkpoint in zip(cue_to_use(task), record["checkpoints"], strict=False):
         steps = 0 if gap is None else gap.median
         reached = checkpoint.get("ordered_step") is not None
         yield steps, reached
@@ -287,10 +277,7 @@ def _samples(record: Record) -> Iterator[tuple[int, bool]]:
 
 
 def draw_gaps(by_gap: Mapping[str, Mapping[str, tuple[int, int]]]) -> Figure:
-    """Draw the rate of reached checkpoints over their gap with Wilson's intervals, a line per evaluation.
-
-    ``by_gap`` maps its name to its `success_by_gap`.
-    """
+    """Draw the rate of reached checkpoints over their gap, given the `success_by_gap` of each evaluation."""
     from matplotlib.lines import Line2D
 
     groups = [group for group in GAPS if any(group in counts for counts in by_gap.values())]

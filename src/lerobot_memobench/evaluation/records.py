@@ -1,4 +1,4 @@
-"""Evaluations read back from their folders: the evaluation's file, rollouts, names.
+"""Evaluations read back from their folders: the evaluation's file, rollouts, names, and the headline of a report.
 
 An evaluation is given as its folder, or as ``NAME=FOLDER``. Evaluations of the same name are one method at several
 replan intervals; without names, those of the same policy are. Evaluations of one policy in several suites of LIBERO are
@@ -16,12 +16,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lerobot_memobench.constants import PAPER, SPLITS
 from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
 from lerobot_memobench.envs.evaluation_file import EXTENT, MOST_EPISODES, POLICY, differences, read_evaluation
-from lerobot_memobench.envs.settings import IMAGE_SETTINGS, SCENE_HASHES
-from lerobot_memobench.errors import MemobenchError, count_of
+from lerobot_memobench.envs.settings import DEFAULTS, IMAGE_SETTINGS, MEMORY_CONTROLS, SCENE_HASHES
+from lerobot_memobench.errors import MemobenchError, count_of, cut
 from lerobot_memobench.evaluation.evidence import EvidenceRates, evidence_of
-from lerobot_memobench.evaluation.metrics import Record, Summary, notes_on, summary_of
+from lerobot_memobench.evaluation.metrics import Record, Summary, inputs_phrase, notes_on, stand_ins_of, summary_of
 from lerobot_memobench.tasks.catalogue import GROUPS
 from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
@@ -29,13 +30,7 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 
 
 class Extent(NamedTuple):
-    """The episodes that an evaluation's file requests.
-
-    Attributes:
-        tasks: names, sorted.
-        episodes: numbers of the episodes of each task.
-        shard: part of the evaluation that the file belongs to, such as ``1/8``; None for all of it.
-    """
+    """The episodes that an evaluation's file requests; ``shard`` is its part of an evaluation, such as ``1/8``."""
 
     tasks: Sequence[str]
     episodes: range
@@ -71,12 +66,6 @@ def extent_of(card: Mapping[str, Any]) -> Extent | None:
     return Extent(sorted({*protocol["tasks"]}), range(first, first + protocol["episodes"]), card.get("shard"))
 
 
-def requested(card: Mapping[str, Any], records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records of a log without episodes that the evaluation's file does not ask for."""
-    extent = extent_of(card)
-    return [record for record in records if extent is None or extent.includes(record)]
-
-
 # --- evaluations ---
 
 HASH_DIGITS = 8
@@ -88,6 +77,7 @@ class Run:
 
     Attributes:
         name: unique in a report. method: whose result it is; several runs of one method differ in the replan interval.
+        card: content of its file; of the first one where several are joined.
         records: rollouts, each with the facts of its file. protocol: of the file, with the extent and ``policy``.
         notes: warnings for the reader, such as unreadable lines.
         missing: a sentence on the episodes that its file asks for and its log lacks; None without such episodes.
@@ -98,6 +88,7 @@ class Run:
     name: str
     method: str
     folder: Path
+    card: Mapping[str, Any]
     records: Sequence[Record]
     protocol: Mapping[str, Any]
     notes: Sequence[str] = field(default_factory=tuple)
@@ -125,19 +116,13 @@ class Run:
         """How often choices follow the evidence, None where scenes were not run with each variant."""
         return evidence_of(self.records)
 
-    @cached_property
-    def card(self) -> dict[str, Any]:
-        """Its file; of the first where several are joined."""
-        return read_evaluation(self.evaluations[0].folder)
-
-    @cached_property
+    @property
     def replan_steps(self) -> int | None:
         """The one interval of all rollouts; the policy's own where none was asked for; None where it is unknown."""
-        logged = {record.get("replan_steps") for record in self.records}
-        if logged == {None}:
-            logged = {self.protocol[POLICY].get("settings", {}).get("n_action_steps")}
-        steps = logged.pop() if len(logged) == 1 else None
-        return steps if isinstance(steps, int) else None
+        steps = self.protocol.get("replan_steps")
+        if steps is None:
+            steps = self.protocol[POLICY].get("settings", {}).get("n_action_steps")
+        return steps if isinstance(steps, int) else None  # joined evaluations may have several
 
 
 def read_runs(words: Sequence[str | Path]) -> list[Run]:
@@ -151,7 +136,10 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     if not labelled:
         raise MemobenchError("no evaluation was given; expected folders that evaluations have written")
     names = folder_names([folder for _, folder in labelled])
-    runs = [_read_suites(folder, name, label or "") for (label, folder), name in zip(labelled, names, strict=True)]
+    runs = []
+    for (label, folder), name in zip(labelled, names, strict=True):
+        suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
+        runs.append(_joined([read_run(folder / suite, name, label or "") for suite in suites or ("",)]))
     first = runs[0].suites[0]
     for run in runs:
         if (suite := run.suites[0]) != first and not {suite, first} <= {*LIBERO_SUITES}:
@@ -159,23 +147,12 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
                 f"{runs[0].folder} is an evaluation of suite={first} and {run.folder} one of suite={suite}, whose "
                 "figures do not compare; report each suite by itself"
             )
-    return _with_methods(_with_suites_joined(runs))
-
-
-def _read_suites(folder: Path, name: str, method: str) -> Run:
-    """Return the evaluation in a folder; those in subfolders with names of LIBERO's suites are joined."""
-    suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
-    return _joined([read_run(folder / suite, name, method) for suite in suites] or [read_run(folder, name, method)])
-
-
-def _with_suites_joined(runs: Sequence[Run]) -> Sequence[Run]:
-    """Join the evaluations of one policy, or of one given name, where evaluations are of different suites of LIBERO."""
-    if len({run.suites for run in runs}) == 1:
-        return runs
-    groups: dict[Any, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(run.method or (*_policy(run), run.replan_steps), []).extend(run.evaluations)
-    return [_joined(group) for group in groups.values()]
+    if len({run.suites for run in runs}) > 1:
+        groups: dict[Any, list[Run]] = {}
+        for run in runs:
+            groups.setdefault(run.method or (*_policy(run), run.replan_steps), []).extend(run.evaluations)
+        runs = [_joined(group) for group in groups.values()]
+    return _with_methods(runs)
 
 
 def _joined(parts: Sequence[Run]) -> Run:
@@ -195,13 +172,14 @@ def _joined(parts: Sequence[Run]) -> Run:
                 raise MemobenchError(f"{a.folder} and {b.folder} differ in {name}; report each by itself")
     values = {key: [part.protocol.get(key) for part in parts] for part in parts for key in part.protocol}
     protocol = {key: group[0] if group.count(group[0]) == len(parts) else group for key, group in values.items()}
+    tasks = sorted(name for part in parts for name in part.protocol["tasks"])
     missing = [f"{part.suites[0]}: {part.missing}" for part in parts if part.missing is not None]
     return replace(
         parts[0],
         name="+".join(dict.fromkeys(part.name for part in parts)),
         folder=parts[0].folder.parent,
         records=[record for part in parts for record in part.records],
-        protocol={**protocol, "tasks": sorted(name for part in parts for name in part.protocol["tasks"])},
+        protocol={**protocol, "tasks": tasks, POLICY: parts[0].protocol[POLICY]},
         notes=[f"{part.suites[0]}: {note}" for part in parts for note in part.notes],
         missing="; ".join(missing) or None,
         parts=parts,
@@ -270,24 +248,23 @@ def run_of(
 ) -> Run:
     """Return the evaluation in a folder, given the lines of its log and the notes of reading them; see `read_run`."""
     card, notes = read_evaluation(folder), [*notes]
-    records, extent = requested(card, joined(folder, card, lines)), extent_of(card)
+    extent, records = extent_of(card), joined(folder, card, lines)
+    records = [record for record in records if extent is None or extent.includes(record)]
     if len(records) < len(lines):
         notes.append(f"{count_of(len(lines) - len(records), 'rollout')} beyond those that were asked for left out")
     missing = None if extent is None else extent.missing(records)
     notes += [*([] if missing is None else [missing]), *notes_on_not_run(records)]
     unrun = {task: len(group) for task, group in not_run(records).items()}
-    protocol = {**_logged_extent(lines), **card["protocol"], POLICY: card[POLICY]}
+    # A file that requests no episodes has the extent of its log; larger numbers are damage.
+    numbers = (line["episode"] + 1 for line in lines if line["episode"] < MOST_EPISODES)
+    logged = {"tasks": sorted({line["task"] for line in lines}), "episodes": max(numbers, default=0)}
+    protocol = {**logged, **card["protocol"], POLICY: card[POLICY]}
     records = [record for record in records if "not_run" not in record]
     if not records:
         reasons = "".join(f"; {note}" for note in notes)
         raise MemobenchError(f"{folder} holds no rollout that can be read{reasons}; run an evaluation first")
-    return Run(name or folder.name, method, folder, records, protocol, [*notes, *notes_on(records)], missing, unrun)
-
-
-def _logged_extent(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the tasks and the number of episodes of a log, for files that do not request them."""
-    numbers = (line["episode"] + 1 for line in lines if line["episode"] < MOST_EPISODES)  # larger ones are damage
-    return {"tasks": sorted({line["task"] for line in lines}), "episodes": max(numbers, default=0)}
+    notes += notes_on(records)
+    return Run(name or folder.name, method, folder, card, records, protocol, notes, missing, unrun)
 
 
 def _split(word: str | Path) -> tuple[str | None, Path]:
@@ -352,6 +329,90 @@ def sweeps(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return {name: group for name, group in methods.items() if len({run.replan_steps for run in group}) > 1}
 
 
+# --- the first line of every report ---
+
+OF_SCENES = ("difficulty", "rules", *IMAGE_SETTINGS)
+CONTROLLED = ("pause_steps", "speed", *MEMORY_CONTROLS)
+PROMPT_IN = {"steps": "prompt in steps (observed)", "reset": "prompt in reset (not observed)"}
+
+
+def headline(runs: Sequence[Run]) -> str:
+    """Return the first line of a report: policy, protocol and the policy's inputs of each evaluation."""
+    if len(runs) == 1:
+        (run,) = runs
+        return f"{policy_name(run)}: {', '.join(protocol_phrases(run))}; {inputs_of(run)}"
+    protocols = [", ".join(protocol_phrases(run)) for run in runs]
+    alike = len(set(protocols)) == 1
+    parts = [
+        f"{run.name}: {policy_name(run)}, {inputs_of(run)}{'' if alike else f' ({protocol})'}"
+        for run, protocol in zip(runs, protocols, strict=True)
+    ]
+    return "; ".join([f"{len(runs)} evaluations{f', {protocols[0]}' if alike else ''}", *parts])
+
+
+def policy_name(run: Run) -> str:
+    """Return the policy: its type and, where it is known, its checkpoint."""
+    policy = run.protocol[POLICY]
+    name = policy.get("type") or next((str(r["policy"]) for r in run.records if r.get("policy")), None)
+    if name is None:
+        return "policy not recorded"
+    checkpoint = (run.card.get("checkpoint") or {}).get("path")
+    if checkpoint is not None:
+        return f"{name} ({cut(str(checkpoint))})"
+    return str(name if "settings" in policy else policy.get("identity") or name)
+
+
+def protocol_phrases(run: Run) -> list[str]:
+    """Return suite, scenes, referent, seeds, episodes per task, replan interval and controls of an evaluation."""
+    records, suites, protocol = run.records, ", ".join(run.suites), run.protocol
+    own = run.card.get("settings", {}).get("env", {}).get("task_dir")
+    unusual = {name: protocol[name] for name in protocol if protocol[name] != getattr(DEFAULTS, name, None)}
+    missing, referents = stand_ins_of(records), sorted({str(record.get("referent", "fixed")) for record in records})
+    intervals = sorted({steps for record in records if (steps := record.get("replan_steps")) is not None})
+    return [
+        f"own tasks, suite={suites}" if own else f"{suites} suite{'s' * (len(run.suites) > 1)}",
+        *(f"{name} {unusual[name]}" for name in OF_SCENES if name in unusual),
+        *[count_of(len(missing), "missing scan")] * bool(missing),
+        *[f"referent {', '.join(referents)}"] * (run.suites[0] not in LIBERO_SUITES),
+        *_seeds(run),
+        extent_phrase(records),
+        *["incomplete"] * (run.missing is not None),
+        *[f"replan interval {', '.join(map(str, intervals))}"] * bool(intervals),
+        *(f"{name}={str(unusual[name]).lower()}" for name in CONTROLLED if name in unusual),
+        *[f"salt {protocol.get('salt')}"] * bool(protocol.get("salt")),
+        *["each scene with each variant"] * bool(protocol.get("evidence")),
+    ]
+
+
+def _seeds(run: Run) -> list[str]:
+    logged = {record["seed"] for record in run.records if record.get("seed") is not None}
+    if not logged:
+        return []
+    first, last = min(logged), max(logged)
+    seeds = f"seeds {first} to {last}" if len(logged) > 1 else f"seed {first}"
+    name = next((name for name, split in SPLITS.items() if first in split and last in split), PAPER)
+    return [seeds if name == PAPER else f"{seeds} ({name})"]
+
+
+def extent_phrase(records: Sequence[Record]) -> str:
+    """Return how many episodes there are of how many tasks, of a single one by its name."""
+    counts = Counter(str(record["task"]) for record in records)
+    low, high = min(counts.values()), max(counts.values())
+    episodes = count_of(high, "episode") if low == high else f"{low} to {high} episodes"
+    if len(counts) == 1:
+        return f"{episodes} of {next(iter(counts))}"
+    return f"{episodes} of each of {len(counts)} tasks"
+
+
+def inputs_of(run: Run) -> str:
+    """Return the policy's inputs and, where there was a demonstration prompt, whether the policy observed it."""
+    inputs, prompt_in = f"inputs: {inputs_phrase(run.records)}", run.protocol.get("prompt_in")
+    if run.protocol.get("demonstration_prompt") is False:
+        return f"{inputs}, no demonstration prompt"
+    prompted = any(r.get("prompt_steps") and r.get("prompt_shown", True) is not None for r in run.records)
+    return f"{inputs}, {PROMPT_IN[prompt_in]}" if prompted and prompt_in in PROMPT_IN else inputs
+
+
 # --- agreement of two records of the same episode ---
 
 SCENES = "scene_hash"
@@ -363,11 +424,7 @@ OUTCOME = (
 
 
 def disagreement(
-    a: Mapping[str, Any],
-    b: Mapping[str, Any],
-    here: str,
-    there: str,
-    ignore: Collection[str] = (),
+    a: Mapping[str, Any], b: Mapping[str, Any], here: str, there: str, ignore: Collection[str] = ()
 ) -> str | None:
     """Return a phrase for the first difference of two records of the same episode, None where they agree.
 

@@ -16,9 +16,8 @@ from typing import Any
 from lerobot_memobench.envs.episode_log import read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.errors import MemobenchError, count_of
-from lerobot_memobench.evaluation.comparison import comparison_data, comparison_section, controls_among
+from lerobot_memobench.evaluation.comparison import comparison_report, controls_among
 from lerobot_memobench.evaluation.evidence import evidence_data, evidence_section
-from lerobot_memobench.evaluation.headline import headline
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
@@ -33,7 +32,7 @@ from lerobot_memobench.evaluation.metrics import (
     report_values,
     summary_of,
 )
-from lerobot_memobench.evaluation.records import Run, run_of, sweeps, unlike
+from lerobot_memobench.evaluation.records import Run, headline, run_of, sweeps, unlike
 from lerobot_memobench.evaluation.tables import (
     Cell,
     Name,
@@ -42,7 +41,6 @@ from lerobot_memobench.evaluation.tables import (
     Report,
     Section,
     Table,
-    best_in_columns,
     percent_text,
     to_markdown,
     with_ids,
@@ -58,10 +56,10 @@ REPORT_JSON, REPORT_MARKDOWN = "report.json", "report.md"
 
 
 def write_report(directory: str | Path) -> Run:
-    """Read the log under ``directory`` and write ``report.json`` and ``report.md`` into it.
+    """Write ``report.json`` and ``report.md`` into the folder of a log, and return the evaluation, see `read_run`.
 
     ``episodes.jsonl`` gets the lines of the workers' files that it lacks. The caller holds the folder (`locked`) where
-    another process may write to it. Return the evaluation with warnings, see `read_run`.
+    another process may write to it.
     """
     directory, notes = Path(directory), list[str]()
     lines = read_lines(directory, notes)
@@ -93,12 +91,13 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
         sections += _sections(runs[0])
         data = evaluation_data(runs[0])
     else:
-        notes, controls, levels = unlike(runs), list(controls_among(runs)), granularity(runs)
+        notes, levels = unlike(runs), granularity(runs)
+        controls = [comparison_report(control, overall=True) for control in controls_among(runs)]
         sections = [
             Section("Evaluations", [evaluations_table(runs, notes), joined_table(runs)], notes=notes),
             *sections,
-            *(comparison_section(control, overall=True) for control in controls),
-            *([granularity_section(runs, levels)] if levels else []),
+            *(section for control in controls for section in control.sections),
+            *(levels.sections if levels else []),
         ]
         for run in runs:
             section, *evidence = _sections(run)
@@ -108,11 +107,9 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
             sections += [section, *evidence]
         data = {"evaluations": {run.name: evaluation_data(run) for run in runs}, "notes": notes}
         if controls:
-            data["controls"] = [comparison_data(control, overall=True) for control in controls]
+            data["controls"] = [control.data for control in controls]
         if levels:
-            data["granularity"] = {
-                name: {"level": level, "own_labels": _percentages(own.average)} for name, (level, own) in levels.items()
-            }
+            data["granularity"] = levels.data
     if swept:
         data["replan_sweep"] = {
             method: {
@@ -125,7 +122,6 @@ def evaluation_report(runs: Sequence[Run]) -> Report:
 
 
 def _sections(run: Run) -> list[Section]:
-    """Return the tables of an evaluation, and of its evidence where scenes were run with each variant."""
     summary = run.summary
     prefixes = [prefix_table(summary)] if any(task.prefix for task in summary.tasks.values()) else []
     tables = [memory_types_table(summary), tasks_table(summary), *prefixes, failures_table(summary)]
@@ -163,8 +159,8 @@ def evaluation_data(run: Run) -> dict[str, Any]:
             name: [percent(rate.value) for rate in task.ordered_prefix] for name, task in summary.tasks.items()
         },
         "pooled": {
-            "checkpoints": _pooled(summary.pooled_checkpoints),
-            **{metric: _pooled(rate) for metric, rate in summary.pooled.items()},
+            name: {"percent": percent(rate.value), "n": rate.n}
+            for name, rate in {"checkpoints": summary.pooled_checkpoints, **summary.pooled}.items()
         },
         "failures_by_task": {name: dict(task.failures) for name, task in summary.tasks.items()},
         "missing": run.missing,
@@ -181,15 +177,11 @@ def _percentages(row: Row) -> dict[str, float | None]:
     return {metric: percent(rate.value) for metric, rate in row.items()}
 
 
-def _pooled(rate: Rate) -> dict[str, Any]:
-    return {"percent": percent(rate.value), "n": rate.n}
-
-
 # --- sentences ---
 
 
 def pooled_sentence(summary: Summary) -> str:
-    """Return the rates over all checkpoint records; no intervals, since records of one rollout are not independent."""
+    """Return the rates over all checkpoint records, without intervals: records of one rollout are not independent."""
     parts = [
         f"{metric} {percent_text(rate.value)} ({count_of(rate.n, 'record')})"
         for metric, rate in summary.pooled.items()
@@ -204,10 +196,8 @@ def pooled_sentence(summary: Summary) -> str:
 
 def failure_line(summary: Summary) -> str:
     """Return the failures in one line, for under a table."""
-    failed = {name: count for name, count in summary.failures.items() if count}
-    if not failed:
-        return "no failed rollouts"
-    return "failed rollouts: " + ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in failed.items())
+    failed = [f"{count} {name.replace('_', ' ')}" for name, count in summary.failures.items() if count]
+    return f"failed rollouts: {', '.join(failed)}" if failed else "no failed rollouts"
 
 
 # --- tables of one evaluation ---
@@ -221,7 +211,7 @@ HOW_TO_READ = {
 
 
 def rates_table(summary: Summary) -> Table:
-    """Return one table of all tasks, each memory type's or suite's rates after them, and the average."""
+    """Return all tasks, each memory type's or suite's rates after its tasks, and the average."""
     rows: list[tuple[Cell, ...]] = []
     strong, rules = set(), set()
     for group, row in {**summary.memory_types, **summary.means}.items():
@@ -258,7 +248,7 @@ def tasks_table(summary: Summary) -> Table:
 
 
 def rate_row(name: Cell, row: Row) -> tuple[Cell, ...]:
-    """Return a row of a table of rates: name, n, metrics."""
+    """Return name, n, metrics."""
     return (name, row["SR"].n, *row.values())
 
 
@@ -298,7 +288,7 @@ FURTHER_NOTES = {
 
 
 def failures_table(summary: Summary) -> Table:
-    """Return how rollouts ended, in all and by memory type."""
+    """Return the outcomes of rollouts, in all and by memory type."""
     counts: dict[str, Mapping[str, int]] = {"all": outcomes(summary, summary.tasks)}
     for memory_type in summary.memory_types if len(summary.memory_types) > 1 else ():
         counts[memory_type] = outcomes(summary, summary.tasks_of(memory_type))
@@ -319,7 +309,7 @@ def failures_table(summary: Summary) -> Table:
 
 
 def outcomes(summary: Summary, names: Iterable[str]) -> dict[str, int]:
-    """Return how the rollouts of some tasks ended: success, then every class of failure -> rollouts."""
+    """Return the number of rollouts of some tasks with each outcome: success, then the classes of failure."""
     tasks = [summary.tasks[name] for name in names]
     failed = {failure: sum(task.failures.get(failure, 0) for task in tasks) for failure in summary.failures}
     return {"success": sum(task.rates["SR"].n for task in tasks) - sum(failed.values()), **failed}
@@ -340,7 +330,7 @@ def evaluations_table(runs: Sequence[Run], notes: Sequence[str]) -> Table:
     rows = [run_row(run, columns) for run in runs]
     note = " ".join([NOTE, *notes])
     wide = wide_columns(LEADING, columns, runs[0].summary.average)
-    return Table("overview", "Evaluations", rows=rows, note=note, best=best_in_columns(rows), **wide)
+    return Table("overview", "Evaluations", rows=rows, note=note, mark_best=True, **wide)
 
 
 def run_row(run: Run, columns: Sequence[str] = PAPER_COLUMNS) -> tuple[Cell, ...]:
@@ -356,7 +346,7 @@ def all_rates(summary: Summary, columns: Sequence[str]) -> list[Rate]:
 
 
 def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
-    """Return the groups of columns of a wide table: the paper's, or the suites of LIBERO and their average."""
+    """Return the groups of columns of a wide table."""
     if runs[0].summary.grouping == MEMORY_TYPE:
         return PAPER_COLUMNS
     suites = {name for run in runs for name in run.summary.memory_types}
@@ -364,14 +354,14 @@ def columns_of(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def wide_columns(leading: tuple[str, ...], columns: Sequence[str], metrics: Iterable[str]) -> dict[str, Any]:
-    """Return header and groups of a table whose rows are leading cells, then ``metrics`` under each of ``columns``."""
+    """Return arguments of a table whose rows are leading cells, then ``metrics`` under each of ``columns``."""
     metrics = tuple(metrics)
-    groups = (*(("", 1) for _ in leading), *((name, len(metrics)) for name in columns))
+    groups = (*("" for _ in leading), *(name for name in columns for _ in metrics))
     return {"header": (*leading, *metrics * len(columns)), "groups": groups, "intervals": False}
 
 
 def joined_table(runs: Sequence[Run]) -> Table:
-    """Return one row per task, memory type and average, with the rates of all evaluations next to each other."""
+    """Return one row per task, memory type and average, with the rates of all evaluations."""
     metrics = tuple(runs[0].summary.average)
     absent: Row = dict.fromkeys(metrics, Rate(None, 0))
     summaries = [run.summary for run in runs]
@@ -383,24 +373,23 @@ def joined_table(runs: Sequence[Run]) -> Table:
         of_runs = [source.get(name, absent) for source in sources]
         rows.append((name, *(row[metric] for metric in metrics for row in of_runs)))
 
-    for memory_type in GROUPS:
-        names = dict.fromkeys(name for summary in summaries for name in summary.tasks_of(memory_type))
+    overall = [summary.memory_types | summary.means for summary in summaries]
+    for group in dict.fromkeys([*GROUPS, *(name for rates in overall for name in rates)]):
+        names = dict.fromkeys(name for summary in summaries for name in summary.tasks_of(group))
         for name in names:
             add(Name(name), tasks)
-        if names:
+        if any(group in rates for rates in overall):
             strong.add(len(rows))
-            add(memory_type, (summary.memory_types for summary in summaries))
+            add(group, overall)
+        if names:
             rules.add(len(rows))
-    for name in dict.fromkeys(name for summary in summaries for name in summary.means):
-        strong.add(len(rows))
-        add(name, (summary.means for summary in summaries))
     table = Table(
         "joined",
         "Rates by task",
         ("task", *(run.name for _ in metrics for run in runs)),
         rows,
         note="Per cent; – is not applicable. Intervals: in CSV, JSON and the report of each evaluation alone.",
-        groups=(("", 1), *((metric, len(runs)) for metric in metrics)),
+        groups=("", *(metric for metric in metrics for _ in runs)),
         strong=strong,
         rules=rules,
         intervals=False,
@@ -426,14 +415,14 @@ def sweep(method: str, runs: Sequence[Run]) -> Section:
             ("replan interval", "n", *first.average),
             averages,
             note=f"{HOW_TO_READ[first.grouping]} {inputs}",
-            best=best_in_columns(averages),
+            mark_best=True,
         ),
         Table(
             f"replan-types-{slug}",
             f"{first.grouping.capitalize()}s by replan interval: {method}",
             rows=types,
             note=inputs,
-            best=best_in_columns(types),
+            mark_best=True,
             **wide_columns(("replan interval",), columns, first.average),
         ),
     )
@@ -462,31 +451,25 @@ def best_interval(runs: Sequence[Run], metric: str) -> tuple[list[int], Rate | N
 # --- annotation granularity ---
 
 
-def granularity(runs: Iterable[Run]) -> dict[str, tuple[str, Summary]]:
-    """Return name of an evaluation -> level of the subgoals taught to its policy, and rates under that level's labels.
-
-    It is empty unless the policies were taught with several levels.
-    """
+def granularity(runs: Sequence[Run]) -> Report | None:
+    """Return rates under the labels of the subgoals taught to each policy; None unless these differ in their level."""
     levels = [(run, run.protocol[POLICY].get("settings", {}).get("subgoal_level")) for run in runs]
     known = [(run, level) for run, level in levels if level in LEVELS]
     if len({level for _, level in known}) < 2:
-        return {}
-    return {run.name: (level, summary_of(with_labels_of(level, run.records))) for run, level in known}
-
-
-def granularity_section(runs: Sequence[Run], levels: Mapping[str, tuple[str, Summary]]) -> Section:
-    """Return the section of rates by subgoal level, of `granularity`."""
-    averages = {run.name: run.summary.average for run in runs}
-    rows: list[list[Cell]] = [
-        [name, level, *averages[name].values(), *(own.average[metric] for metric in PROCESS_METRICS)]
-        for name, (level, own) in levels.items()
-    ]
+        return None
+    rows: list[list[Cell]] = []
+    data = {}
+    for run, level in known:
+        own = summary_of(with_labels_of(level, run.records)).average
+        rows.append([run.name, level, *run.summary.average.values(), *(own[metric] for metric in PROCESS_METRICS)])
+        data[run.name] = {"level": level, "own_labels": _percentages(own)}
     header = ("evaluation", "level", *METRICS, *(f"{metric}, own labels" for metric in PROCESS_METRICS))
     sentence = (
         f"MSR, MUR and MCR are given under the evaluated (intermediate) labels and under those of each policy's own "
         f"level: average of {MEMORY_TYPE}s, per cent, with Wilson's 95 % interval over rollouts."
     )
-    return Section("Annotation granularity", [Table("granularity", "", header, rows)], [sentence])
+    title = "Annotation granularity"
+    return Report(title, [Section(title, [Table("granularity", "", header, rows)], [sentence])], data)
 
 
 def with_labels_of(level: str, records: Sequence[Record]) -> list[Record]:
@@ -515,11 +498,7 @@ HUB_FILE = ".eval_results/memobench.yaml"
 
 
 def huggingface_yaml(run: Run, dataset: str) -> str:
-    """Return the content of `HUB_FILE`: an entry per metric, with the headline of the report as its notes.
-
-    Args:
-        dataset: repository of the benchmark's dataset on the hub, as ``user/name``.
-    """
+    """Return the content of `HUB_FILE`; ``dataset`` is the benchmark's on the hub, as ``user/name``."""
     import yaml
     from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 

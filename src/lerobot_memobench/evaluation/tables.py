@@ -9,8 +9,9 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, OverflowMethod, RenderableType, RenderResult
@@ -19,7 +20,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from lerobot_memobench.evaluation.metrics import Rate, percent
-from lerobot_memobench.tasks.libero_suites import libero_id
+from lerobot_memobench.tasks.catalogue import libero_id
 
 NOT_APPLICABLE = "–"
 
@@ -35,7 +36,7 @@ class Numbers(str):
 
 
 class PrefixRates(NamedTuple):
-    """Two rates in one cell: of prefixes in any order, and in order."""
+    """Two rates in one cell."""
 
     any_order: Rate
     in_order: Rate
@@ -51,10 +52,9 @@ class Table:
 
     Attributes:
         key: short name, unique in a report.
-        rows: each as long as the header.
-        groups: (title, columns) over the header, from the left; "" for none.
+        groups: title over each column, "" for none; neighbours with equal titles are one group.
         strong: rows that sum up, by index. rules: rows before which a line is drawn.
-        best: (row, column) of the cells to be marked as best.
+        mark_best: whether the best rates of each column are marked.
         intervals: whether rates are followed by their interval; CSV always has its bounds.
     """
 
@@ -63,16 +63,11 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     note: str = ""
-    groups: Sequence[tuple[str, int]] = ()
+    groups: Sequence[str] = ()
     strong: Collection[int] = ()
     rules: Collection[int] = ()
-    best: Collection[tuple[int, int]] = ()
+    mark_best: bool = False
     intervals: bool = True
-
-    def __post_init__(self) -> None:
-        for row in self.rows:
-            if len(row) != len(self.header):
-                raise ValueError(f"a row of the table {self.key!r} has {len(row)} cells for {len(self.header)} columns")
 
     @property
     def names(self) -> list[str]:
@@ -80,9 +75,20 @@ class Table:
         return [f"{title} {name}".lstrip() for title, name in zip(self.titles, self.header, strict=True)]
 
     @property
-    def titles(self) -> list[str]:
+    def titles(self) -> Sequence[str]:
         """The title of the group over each column, "" for none."""
-        return [title for title, span in self.groups for _ in range(span)] or [""] * len(self.header)
+        return self.groups or [""] * len(self.header)
+
+    @cached_property
+    def best(self) -> set[tuple[int, int]]:
+        """The cells, (row, column), with the highest rate of their column, all of them where they tie as printed."""
+        best = set[tuple[int, int]]()
+        for column, cells in enumerate(zip(*self.rows, strict=True) if self.mark_best else ()):
+            printed = {row: percent(cell.value) for row, cell in enumerate(cells) if isinstance(cell, Rate)}
+            highest = max((value for value in printed.values() if value is not None), default=None)
+            if len(printed) > 1 and highest is not None:
+                best |= {(row, column) for row, value in printed.items() if value == highest}
+        return best
 
     def text(self, cell: Cell, interval: str = " [{}–{}]", escape: Callable[[str], str] = str) -> str:
         """Return a cell as text; ``interval`` is the format of an interval."""
@@ -114,7 +120,7 @@ class Report:
 
     title: str
     sections: Sequence[Section]
-    data: Mapping[str, object] = field(default_factory=dict)
+    data: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def tables(self) -> list[Table]:
@@ -141,20 +147,8 @@ def with_ids(table: Table) -> Table:
         table,
         header=("id", *table.header),
         rows=[(Numbers("" if k is None else k), *row) for k, row in zip(ids, table.rows, strict=True)],
-        groups=(("", 1), *table.groups) if table.groups else (),
-        best=[(row, column + 1) for row, column in table.best],
+        groups=("", *table.groups) if table.groups else (),
     )
-
-
-def best_in_columns(rows: Sequence[Sequence[Cell]]) -> set[tuple[int, int]]:
-    """Return the cells that hold the highest rate of their column, all of them where they tie as printed."""
-    best = set[tuple[int, int]]()
-    for column, cells in enumerate(zip(*rows, strict=True)):
-        printed = {row: percent(cell.value) for row, cell in enumerate(cells) if isinstance(cell, Rate)}
-        highest = max((value for value in printed.values() if value is not None), default=None)
-        if len(printed) > 1 and highest is not None:
-            best |= {(row, column) for row, value in printed.items() if value == highest}
-    return best
 
 
 # --- GitHub's Markdown ---
@@ -192,16 +186,14 @@ def markdown_table(table: Table) -> list[str]:
 
 
 def markdown_text(words: str) -> str:
-    """Return text in one line with every mark of Markdown escaped, as names and notes in logs of strangers may hold.
-
-    Within a word ``_`` is none.
-    """
+    """Return text in one line with every mark of Markdown escaped: names and notes may be of strangers."""
     line = " ".join("".join(c if c.isprintable() else " " for c in words).split())
+    # Within a word, an underscore is no mark.
     return re.sub(r"([|*`<>~\[\]\\]|&(?=#?\w+;)|(?<![^\W_])_|_(?![^\W_]))", r"\\\1", line)
 
 
 def _paragraph(words: str) -> str:
-    """Return text that begins a line, where other marks count: of headings, lists and rules."""
+    # At the begin of a line, marks of headings, lists and rules count as well.
     return re.sub(r"^(\d*)([-+=#.)])", r"\1\\\2", markdown_text(words))
 
 
@@ -275,7 +267,8 @@ def latex_table(table: Table) -> list[str]:
 
 def _latex_groups(table: Table) -> list[str]:
     cells, rules, column = [], [], 1
-    for title, span in table.groups:
+    for title, columns in groupby(table.groups):
+        span = len([*columns])
         cells.append(rf"\multicolumn{{{span}}}{{c}}{{{latex_text(title)}}}" if title else " & " * (span - 1))
         if title:
             rules.append(rf"\cmidrule(lr){{{column}-{column + span - 1}}}")
@@ -287,7 +280,6 @@ def _latex_groups(table: Table) -> list[str]:
 
 WIDTH = 140
 """Columns of a report that is written to a file."""
-
 MOST_COLUMNS = 15
 """Columns of a table with groups that fit into a terminal."""
 
@@ -312,16 +304,14 @@ def to_text(report: Report) -> str:
 
 
 INDENT = 2
-
-PLAIN = Console(width=10_000, markup=False, highlight=False)
-"""Measures the width of texts."""
+PLAIN = Console(width=10_000, markup=False, highlight=False)  # measures texts that no edge breaks
 
 
 class Unbroken:
-    """A table in which no name is broken, however narrow the terminal is: to be printed with ``crop=False``.
+    """A table in which no name is broken: to be printed with ``crop=False``.
 
-    In a terminal that is too narrow each name has a line of its own, over its row; a file has no edge. ``table`` must
-    not change any more; ``column`` is that of the names.
+    In a terminal that is too narrow, each name has a line of its own, over its row. ``table`` must not change any more;
+    ``column`` is that of the names.
     """
 
     def __init__(self, table: RichTable, column: int = 0) -> None:
@@ -341,7 +331,6 @@ class Unbroken:
             yield from self._under_names(options.max_width)
 
     def _under_names(self, room: int) -> RenderResult:
-        """Yield each row in two lines: the cells up to the name, and the others below."""
         columns = self.table.columns
         after = columns[self.column + 1 :]
         wished = [[Measurement.get(PLAIN, PLAIN.options, cell) for cell in (c.header, *c.cells)] for c in after]
@@ -410,33 +399,27 @@ def _in_parts(table: Table) -> list[Table]:
     if len(parts) == 1:
         return [table]
     return [
-        _columns(table, [*leading, *part], table.title if k == 0 else f"{table.title}, continued")
+        replace(
+            table,
+            title=table.title if k == 0 else f"{table.title}, continued",
+            header=[table.header[column] for column in chosen],
+            rows=[[row[column] for column in chosen] for row in table.rows],
+            groups=[titles[column] for column in chosen],
+        )
         for k, part in enumerate(parts)
+        for chosen in [[*leading, *part]]
     ]
 
 
 def _least_width(table: Table, column: int) -> int:
-    """Return the width of a column whose texts are broken between words and whose names are whole."""
     cells = [row[column] for row in table.rows]
     texts = [table.text(cell) for cell in cells]
-    if not any(isinstance(cell, Name) for cell in cells):
+    if not any(isinstance(cell, Name) for cell in cells):  # other texts are broken between words
         texts = [word for text in texts for word in text.split()]
     return max(map(len, [*table.header[column].split(), *texts]), default=0) + 2
 
 
-def _columns(table: Table, chosen: Sequence[int], title: str) -> Table:
-    return replace(
-        table,
-        title=title,
-        header=[table.header[column] for column in chosen],
-        rows=[[row[column] for column in chosen] for row in table.rows],
-        groups=[(table.titles[column], 1) for column in chosen],
-        best=[(row, chosen.index(column)) for row, column in table.best if column in chosen],
-    )
-
-
 # --- JSON, CSV, and all formats ---
-
 
 WRITERS: Mapping[str, Callable[[Report], str]] = {
     "table": to_text,
@@ -478,12 +461,10 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
 
 
 def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
-    """Return rows, column -> value, as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field.
-
-    A name that a spreadsheet would take for a formula gets an apostrophe in front: logs may be of strangers.
-    """
+    """Return rows, column -> value, as CSV (RFC 4180, but lines end in a plain line feed); None is an empty field."""
 
     def escaped(value: object) -> object:
+        # A spreadsheet would run names in logs of strangers as formulas.
         formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r"))
         return f"'{value}" if formula else value
 

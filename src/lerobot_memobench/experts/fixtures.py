@@ -41,8 +41,7 @@ from lerobot_memobench.experts.travel import (
 )
 from lerobot_memobench.sim.asset import Articulation
 
-HANDLE_TILT = np.radians(35)
-"""Downward tilt of the hand at a handle: the flange clears the table, rad."""
+HANDLE_TILT = np.radians(35)  # downward tilt of the hand at a handle: the flange clears the table, rad
 WIDE_HANDLE_ROLL, WIDE_HANDLE_TILT = np.radians(30), np.radians(27)
 """Roll and downward tilt of the hand at a bar that is longer than the open fingers, rad. With more roll or less tilt
 the hand touches the table below the lowest drawer, stays above the bar and slips off; with more tilt it touches the
@@ -50,32 +49,24 @@ handle above; with less roll the bar does not fit between the fingers."""
 HANDLE_APPROACH, HANDLE_MARGIN = (0.14, 0.07, 0.0), 0.03
 """Distances of the open fingers from a handle on the way to it, and the margin between the hand, which turns on this
 way, and objects in front of the handle, m."""
-DOWNWARD_REACH = 0.72
-"""Distance from the arm's base up to which a downward hand moves freely, m."""
+DOWNWARD_REACH = 0.72  # distance from the arm's base up to which a downward hand moves freely, m
 DOOR_THICKNESS = 0.02
 DOOR_EDGE_INSET, DOOR_EDGE_DEPTH = 0.012, 0.018
 """Grasp on a door's upper edge: distance from the handle towards the hinge, and depth, m."""
-SWING_LEAD = 0.13
-"""Angle by which the hand leads a door along its arc, rad."""
-SWING_END_LEAD = 0.04
-"""Lead at the end of the swing, rad; a faster hand would throw the door out of reach."""
-FREE_SWING_END_LEAD = 0.015
-"""Lead at the end of the swing of a door without friction, rad."""
-PUSH_GAP = 0.06
-"""Distance of the closed fingers in front of a handle before pushing, m."""
+SWING_LEAD = 0.13  # angle by which the hand leads a door along its arc, rad
+SWING_END_LEAD = 0.04  # lead at the end of the swing, rad; a faster hand would throw the door out of reach
+FREE_SWING_END_LEAD = 0.015  # lead at the end of the swing of a door without friction, rad
+PUSH_GAP = 0.06  # distance of the closed fingers in front of a handle before pushing, m
 PUSH_SIDES = (0.0, 0.02, -0.02, 0.04, -0.04, 0.06, -0.06)
 """Displacements along a handle at which a drawer is pushed, in the order of preference, m."""
-HANDLE_GRIP_DEPTH = 0.018
-"""Depth of the grasp below a handle's upper end, m."""
+HANDLE_GRIP_DEPTH = 0.018  # depth of the grasp below a handle's upper end, m
 
-SWEEP_LEAD = 0.16
-"""Angle by which the hand leads a door in one sweep, rad."""
+SWEEP_LEAD = 0.16  # angle by which the hand leads a door in one sweep, rad
 PANEL_PUSH_INSET, PANEL_PUSH_DEPTH = 0.045, 0.030
 """Contact point for pushing a door: distance from the handle towards the hinge, and depth below the upper edge, m."""
 PANEL_APPROACH_GAP, PANEL_CONTACT_GAP = 0.06, 0.018
 """Distance of the hand from the panel's centre plane before and during the push, m."""
-MAX_SWEEP_STEPS = 150
-"""Maximum number of control steps of a sweep."""
+MAX_SWEEP_STEPS = 150  # maximum number of control steps of a sweep
 
 
 def _joint_position(hand: Hand, name: str) -> float:
@@ -100,10 +91,8 @@ class _HandleGrip:
 
     hand: Hand
     articulation: Articulation
-    tilt: float
-    """Downward tilt, rad."""
-    roll: float = 0.0
-    """Roll about the fingers, rad."""
+    tilt: float  # downward tilt, rad
+    roll: float = 0.0  # roll about the fingers, rad
 
     def pose(self, back: float = 0.0) -> tuple[Array, Array]:
         """Return the position (3,) at a distance back from the handle along the fingers, m, and the rotation (3, 3)."""
@@ -152,7 +141,6 @@ def open_drawer(hand: Hand, region: str) -> Steps:
 
 
 def _pull_drawer(hand: Hand, region: str, rotation: Array, out: Array) -> Steps:
-    """Pull a drawer by its handle until it is open or the handle slips."""
     for _ in range(90):
         articulation, q = hand.sim.world.articulation(region)
         if q < articulation.open_below - 0.006:
@@ -180,7 +168,7 @@ def close_drawer(hand: Hand, region: str) -> Steps:
 
 
 def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Array) -> Array:
-    """Return the displacement (3,) along a handle at which the hand, 20 cm wide, pushes with the least collision, m."""
+    # The hand is 20 cm wide along the handle.
     handle, _ = hand.sim.site_pose(articulation.handle_site)
 
     def collision(aside: float) -> float:
@@ -190,7 +178,6 @@ def _free_side(hand: Hand, articulation: Articulation, rotation: Array, out: Arr
 
 
 def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, out: Array, aside: Array) -> Steps:
-
     def before(gap: float) -> Array:
         return hand.sim.site_pose(articulation.handle_site)[0] + gap * out + aside
 
@@ -201,7 +188,6 @@ def _approach_handle(hand: Hand, articulation: Articulation, rotation: Array, ou
 
 
 def _push_drawer(hand: Hand, region: str, rotation: Array, out: Array, aside: Array) -> Steps:
-    """Push a drawer by its handle until it is closed or the fingers slip off sideways."""
     articulation, _ = hand.sim.world.articulation(region)
     spare = min(0.003, articulation.closed_q - articulation.closed_above)
     shut = sustained(lambda: _joint_position(hand, region) > articulation.closed_above + spare)
@@ -269,12 +255,9 @@ class Door:
 
     q: float
     handle: Array
-    outward: Array
-    """Normal of the door's front."""
-    along: Array
-    """Direction from the hinge to the free edge."""
-    edge: Array
-    """Point on the upper edge near the handle, at the panel's centre plane."""
+    outward: Array  # normal of the door's front
+    along: Array  # direction from the hinge to the free edge
+    edge: Array  # point on the upper edge near the handle, at the panel's centre plane
 
 
 def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
@@ -289,10 +272,9 @@ def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     outward = outward if outward @ opening > 0 else -outward
     along = cross(UP, outward)
     along = along if along @ lever > 0 else -along
-    owner = max((other for other in hand.sim.assets if name == other or name.startswith(f"{other}_")), key=len)
     depth = articulation.clearance + articulation.handle_size[1] / 2 + DOOR_THICKNESS / 2
     edge = handle - depth * outward - DOOR_EDGE_INSET * along
-    edge[2] = hand.sim.asset_pose(owner)[0][2] + hand.sim.assets[owner].top
+    edge[2] = hand.sim.asset_pose(name)[0][2] + hand.sim.assets[name].top
     turned = Rotation.from_rotvec(joint.xaxis * ahead).apply
     handle, edge = hinge + turned(lever), hinge + turned(edge - hinge)
     return Door(q + ahead, handle, turned(outward), turned(along), edge)
@@ -384,7 +366,6 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
 
 
 def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
-    """Return whether the swing ends: the door is at its goal, can be pushed by its handle, or has slipped."""
     if door_is_at_goal(door.q, articulation, opening):
         return True
     if not opening and distance_from_base(door.handle + PUSH_GAP * door.outward) < DOWNWARD_REACH - 0.04:
@@ -444,7 +425,6 @@ def sweep_door_shut(hand: Hand, name: str) -> Steps:
 
 
 def _sweep_rotation(hand: Hand, door: Door, position: Array, flip: float) -> Array:
-    """Return the rotation (3, 3) of a hand that closes along the door, leaned to reach a position (3,)."""
     closing = flip * door.along
     lean = reach_lean(hand, position)
     return leaned_rotation(closing, lean - (lean @ closing) * closing)

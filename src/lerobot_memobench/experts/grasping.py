@@ -54,38 +54,29 @@ from lerobot_memobench.experts.travel import (
 )
 from lerobot_memobench.sim.asset import TABLE_TOP, Asset, Grasp
 
-MAX_ATTEMPTS = 4
-"""Maximum attempts at grasping an object or moving a handle, door or knob."""
-LOW_GRASP_ATTEMPTS = 2
-"""Attempts before a tall object is grasped higher."""
-MAX_REACH_SHORTFALL = 0.04
-"""Largest shortfall of the arm's reach for which a low grasp is tried before higher ones, m."""
+MAX_ATTEMPTS = 4  # maximum attempts at grasping an object or moving a handle, door or knob
+LOW_GRASP_ATTEMPTS = 2  # attempts before a tall object is grasped higher
+MAX_REACH_SHORTFALL = 0.04  # largest shortfall of the arm's reach for which a low grasp is tried before higher ones, m
 RAISED_GRASP_OFFSET, MIN_DEPTH_BELOW_TOP = 0.02, 0.0122
 """Height offset of raised grasps, and smallest depth of the finger centre below the object's top, m."""
-FALLEN_COSINE = 0.7
-"""Cosine of the tilt below which an object lies on its side."""
-MAX_EXTRA_COST = 1.5
-"""Largest cost above the best grasp's of a candidate."""
+FALLEN_COSINE = 0.7  # cosine of the tilt below which an object lies on its side
+MAX_EXTRA_COST = 1.5  # largest cost above the best grasp's of a candidate
 SHIFTED_COST = 1.6
 """Cost of a shifted grasp, m; above `MAX_EXTRA_COST`, so that it is chosen only where the others are blocked."""
 FINGER_HALF_WIDTH, MIN_SIDE_GAP = 0.0105, 0.006
 """Half the width of a finger tip, and smallest gap between a box and the near finger at a shifted grasp, m."""
 FUNNEL_SLOPE, FUNNEL_RADIUS = 4.0, 0.006
 """Approach funnel: height per lateral distance beyond the radius, and the radius, m."""
-FUNNEL_CLEARANCE_SHARE = 0.6
-"""Share of the clearance between open fingers and object that limits the funnel's radius."""
+FUNNEL_CLEARANCE_SHARE = 0.6  # share of the clearance between open fingers and object that limits the funnel's radius
 GRASP_STALL_STEPS, GRASP_STALL_DISTANCE = 6, 0.015
 """Steps without progress after which the fingers close in place, and the largest distance to the grasp, m, for example
 on a plate's rim. Policies hardly learn a longer wait without visible change."""
-LIFT_HEIGHT = 0.10
-"""Height to which an object is lifted before transport, m."""
-HOVER_HEIGHT = 0.09
-"""Height above a grasp for aligning the hand, m."""
+LIFT_HEIGHT = 0.10  # height to which an object is lifted before transport, m
+HOVER_HEIGHT = 0.09  # height above a grasp for aligning the hand, m
 MIN_RIM_GAP, MAX_RIM_GAP = 0.004, 0.012
 """Smallest (plate) and largest (deep bowl) gap between a rim and the inner finger during descent, m. Policies need the
 gap because they localise the rim less exactly."""
-RIM_GAP_SLOPE = 0.7
-"""Gap per height of the finger above the container's floor."""
+RIM_GAP_SLOPE = 0.7  # gap per height of the finger above the container's floor
 CLOSING_LEAD = 0.03
 """Reduction of the present opening for targets while closing, because the arm lags behind the fingers, m."""
 MAX_RELEASE_OFFSET, LEVEL_COSINE = 0.03, 0.95
@@ -94,21 +85,16 @@ support."""
 MAX_DRAWER_OFFSET = 0.025
 """Largest distance from the target in a drawer at which an object is released, m; farther away it would lean on a
 wall."""
-MAX_TIPPING = 0.08
-"""Largest decrease of a bowl's upright cosine by grasping; a bowl pressed on its rim slips."""
-MAX_SINKING = 0.002
-"""Depth by which an object may sink into its support, m."""
+MAX_TIPPING = 0.08  # largest decrease of a bowl's upright cosine by grasping; a bowl pressed on its rim slips
+MAX_SINKING = 0.002  # depth by which an object may sink into its support, m
 FAR_SIDE_COST = 0.15
 """Cost of the rim's side opposite to the arm's base. Two sides are often equally good; policies trained on both average
 them and move to the middle."""
-WIDE_GRASP = 0.068
-"""Width from which a grasp is difficult, m."""
+WIDE_GRASP = 0.068  # width from which a grasp is difficult, m
 TIGHT_GRASP, TIGHT_GRASP_SPEED, TIGHT_COST = 0.074, 0.3, 1.5
 """Width from which a grasp leaves little room and the hand descends slowly, m; its speed, and cost in strict tasks."""
-MAX_RIM_LEAN = np.radians(14)
-"""Largest lean along a bowl's wall, rad."""
-MAX_RIGHTING_TILT = np.radians(35)
-"""Largest tilt of a held object that is corrected before placing, rad."""
+MAX_RIM_LEAN = np.radians(14)  # largest lean along a bowl's wall, rad
+MAX_RIGHTING_TILT = np.radians(35)  # largest tilt of a held object that is corrected before placing, rad
 
 
 def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
@@ -116,12 +102,9 @@ def _is_rim(hand: Hand, name: str, grasp: Grasp) -> bool:
 
 
 def _closing_of_fallen(hand: Hand, name: str) -> float:
-    """Return the closing angle for an object that lies on its side: across its narrower horizontal extent, rad.
-
-    In a drawer close along the front: the hand is 20 cm wide and would otherwise collide with the cabinet.
-    """
+    """Return the closing angle for an object that lies on its side: across its narrower horizontal extent, rad."""
     drawer = drawer_containing(hand, name)
-    if drawer is not None:
+    if drawer is not None:  # along the front: across it the hand, 20 cm wide, would collide with the cabinet
         out = opening_direction(hand, hand.sim.world.articulation(drawer)[0])
         return float(np.arctan2(out[0], -out[1]))
     _, rotation = hand.sim.asset_pose(name)
@@ -140,19 +123,14 @@ class _Approach:
     name: str
     grasp: Grasp
     spin: float
-    place: Array | None
-    """Destination of the object's origin (3,), m."""
-    reaching: bool
-    """Whether reaching has priority over avoiding obstacles."""
-    shifted: bool
-    """Whether the grasp is one of `_shifted_grasps`, at which the hand may lean further."""
+    place: Array | None  # destination of the object's origin (3,), m
+    reaching: bool  # whether reaching has priority over avoiding obstacles
+    shifted: bool  # whether the grasp is one of `_shifted_grasps`, at which the hand may lean further
 
     def pose(self, opening: float | None = None) -> tuple[Array, Array]:
         """Return position (3,) and rotation (3, 3) of the grip site at an opening of the fingers; default: the present.
 
-        A rim is grasped with the inner finger close to the wall at every opening: the hand approaches from outside and
-        follows the outer finger while closing, so the bowl's content is not touched. The hand leans away from
-        obstacles, and towards the base if the object or its destination is distant.
+        The hand leans away from obstacles, and towards the base if the object or its destination is distant.
         """
         hand, name, grasp = self.hand, self.name, self.grasp
         opening = hand.sim.gripper_opening() if opening is None else opening
@@ -161,6 +139,8 @@ class _Approach:
         target = position + spun @ np.asarray(grasp.position)
         outward = None
         if _is_rim(hand, name, grasp):
+            # The inner finger is close to the wall at every opening: the hand approaches from outside and follows the
+            # outer finger while closing, so the bowl's content is not touched.
             outward = spun[:, 0] * np.sign(grasp.position[0])
             over = grasp.position[2] - FINGER_REACH - hand.sim.assets[name].supports
             gap = float(np.clip(RIM_GAP_SLOPE * over, MIN_RIM_GAP, MAX_RIM_GAP))
@@ -226,7 +206,6 @@ class _Approach:
 
 
 def _choose_grasp(hand: Hand, name: str, attempt: int, avoid: Array | None, place: Array | None) -> _Approach:
-    """Choose one of an object's grasps by cost; later attempts choose other candidates."""
     asset = hand.sim.assets[name]
     if not asset.grasps:
         raise MemobenchError(
@@ -260,7 +239,6 @@ def _options(
 
 
 def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
-    """Return the grasps of a tall object moved closer to its top."""
     return tuple(
         replace(grasp, position=(*grasp.position[:2], grasp.position[2] + RAISED_GRASP_OFFSET))
         for grasp in asset.grasps
@@ -269,12 +247,11 @@ def _raised_grasps(asset: Asset) -> tuple[Grasp, ...]:
 
 
 def _shifted_grasps(asset: Asset) -> tuple[Grasp, ...]:
-    """Return the grasps of a flat box off its middle: towards an end, towards one side, or both.
-
-    They leave room for the hand, or for a finger, between the box and an obstacle. A taller box would tip over.
-    """
+    """Return the grasps of a flat box off its middle: towards an end, towards one side, or both."""
+    # They leave room for the hand, or for a finger, between the box and an obstacle.
     grasps = []
     for grasp in asset.grasps:
+        # A taller box would tip over.
         if grasp.symmetric or not asset.top - asset.bottom < grasp.width < WIDE_GRASP:
             continue
         across = np.array([np.cos(grasp.yaw), np.sin(grasp.yaw)])
@@ -316,13 +293,10 @@ def _cost(approach: _Approach, avoid: Array | None) -> float:
 def pick(
     hand: Hand, name: str, avoid: Array | None = None, place: Array | None = None
 ) -> Generator[NDArray[np.float32], None, Held | None]:
-    """Grasp an object from above and lift it; retry failed grasps with other candidates.
+    """Grasp and lift an object; return it with its pose in the hand, None if all attempts failed.
 
-    Return the object with its pose in the hand, None if all attempts failed.
-
-    Args:
-        avoid: horizontal direction (3,) along which the fingers should not close, because of the destination.
-        place: destination of the object's origin (3,), m; distant destinations need other grasps.
+    ``avoid``: horizontal direction (3,) along which the fingers should not close, because of the destination.
+    ``place``: destination of the object's origin (3,), m; distant destinations need other grasps.
     """
     failed = 0
     for attempt in range(MAX_ATTEMPTS):
@@ -378,11 +352,8 @@ def carry(
 ) -> Steps:
     """Move the held object's origin above a destination (3,) and lower it; stop early if it is dropped.
 
-    Args:
-        destination: returns the present target of the object's origin (3,), m.
-        turn: rotation (3, 3) of the hand on arrival.
-        clearance, tolerance: height of the approach above the destination, and tolerance of the origin, m.
-        support: ignored as an obstacle.
+    ``turn``: rotation (3, 3) of the hand on arrival. ``clearance``: height of the approach above the destination, m.
+    ``support``: ignored as an obstacle.
     """
 
     def at(height: float) -> Target:

@@ -16,37 +16,25 @@ from lerobot_memobench.tasks.task import STRICT
 Array = NDArray[np.float64]
 Steps = Generator[NDArray[np.float32], None, None]
 """A motion: yields actions (7,), each computed from the present state."""
-Target = Callable[[], Array]
-"""Returns the present value of a moving target position (3,) or rotation (3, 3)."""
+Target = Callable[[], Array]  # returns the present value of a moving target position (3,) or rotation (3, 3)
 
 OPEN, CLOSED = -1.0, 1.0
 DOWN = np.array([0.0, 0.0, -1.0])
 UP = np.array([0.0, 0.0, 1.0])
 
-PASSING_TOLERANCE = 0.02
-"""Position tolerance from which the hand need not slow down, m."""
-ROTATION_SPEED = 0.35
-"""Largest angular action."""
-ARRIVAL_ACTION = 0.4
-"""Largest linear action at which the hand stops without overshoot."""
-STALL_STEPS = 25
-"""Steps without progress after which the hand counts as blocked."""
-SHOULDER_BODY = "robot0_link2"
-"""Body whose origin is the shoulder's centre of rotation."""
+PASSING_TOLERANCE = 0.02  # position tolerance from which the hand need not slow down, m
+ROTATION_SPEED = 0.35  # largest angular action
+ARRIVAL_ACTION = 0.4  # largest linear action at which the hand stops without overshoot
+STALL_STEPS = 25  # steps without progress after which the hand counts as blocked
+SHOULDER_BODY = "robot0_link2"  # body whose origin is the shoulder's centre of rotation
 FLANGE_LENGTH, WRIST_OFFSET = 0.2035, 0.088
 """Distance from the grip site back to the last joint, and from there sideways to the wrist, m."""
-MAX_STRETCH = 0.70
-"""Largest distance from shoulder to wrist, m; the arm is straight at 0.719 m."""
-COMFORTABLE_STRETCH = 0.685
-"""Distance from shoulder to wrist up to which reaching has no cost, m."""
-STRAIGHT_ELBOW_ANGLE = -0.42
-"""Elbow angle above which the arm is bent backwards through its straight pose, rad."""
-EMPTY_OPENING = 0.003
-"""Finger opening up to which the hand is empty, m."""
-MAX_OPENING_STEPS = 40
-"""Maximum number of steps for opening the fingers."""
-MAX_LAST_JOINT_ANGLE = 2.75
-"""Largest angle of the last joint, rad; its axis is the direction of the fingers."""
+MAX_STRETCH = 0.70  # largest distance from shoulder to wrist, m; the arm is straight at 0.719 m
+COMFORTABLE_STRETCH = 0.685  # distance from shoulder to wrist up to which reaching has no cost, m
+STRAIGHT_ELBOW_ANGLE = -0.42  # elbow angle above which the arm is bent backwards through its straight pose, rad
+EMPTY_OPENING = 0.003  # finger opening up to which the hand is empty, m
+MAX_OPENING_STEPS = 40  # maximum number of steps for opening the fingers
+MAX_LAST_JOINT_ANGLE = 2.75  # largest angle of the last joint, rad; its axis is the direction of the fingers
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -84,10 +72,8 @@ NEUTRAL_CLOSING = np.array([-0.5, np.sqrt(0.75), 0.0])
 
 
 def downward(yaw: float) -> Array:
-    """Return the rotation (3, 3) of a downward hand that closes along the horizontal angle ``yaw``, rad.
-
-    A parallel gripper is symmetric: of the two orientations choose the one farther from the last joint's limits.
-    """
+    """Return the rotation (3, 3) of a downward hand that closes along the horizontal angle ``yaw``, rad."""
+    # A parallel gripper is symmetric: of the two orientations choose the one farther from the last joint's limits.
     closing = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     return frame(DOWN, closing if closing @ NEUTRAL_CLOSING >= 0 else -closing)
 
@@ -99,10 +85,8 @@ class Hand:
         self.sim, self.rng = sim, rng
         self.strict = sim.task.suite == STRICT
         """Whether the task is strict; published tasks keep the motions of their published demonstrations."""
-        self.speed = float(rng.uniform(0.62, 0.82))
-        """Largest linear action of this episode; 1 is about 0.25 m/s."""
-        self.slew = float(rng.uniform(0.16, 0.22))
-        """Largest change of an action's component per step."""
+        self.speed = float(rng.uniform(0.62, 0.82))  # largest linear action of this episode; 1 is about 0.25 m/s
+        self.slew = float(rng.uniform(0.16, 0.22))  # largest change of an action's component per step
         self._last: Array = np.zeros(6)
 
     @property
@@ -136,10 +120,10 @@ class Hand:
         self._last = np.round(self._last + np.clip(wanted - self._last, -self.slew, self.slew), 6) + 0.0
         return np.append(self._last, gripper).astype(np.float32)
 
-    def rest(self, gripper: float) -> NDArray[np.float32]:
-        """Return the action (7,) that decelerates the present motion."""
+    def rest(self) -> NDArray[np.float32]:
+        """Return the action (7,) that decelerates the present motion, with open fingers."""
         self._last = self._last - np.clip(self._last, -self.slew, self.slew)
-        return np.append(self._last, gripper).astype(np.float32)
+        return np.append(self._last, OPEN).astype(np.float32)
 
     def radial(self, place: Array) -> Array:
         """Return the horizontal direction (3,) from the arm's base to a position."""

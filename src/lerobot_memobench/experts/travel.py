@@ -25,47 +25,36 @@ from lerobot_memobench.sim.asset import TABLE_TOP, Articulation, Asset
 from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.tasks.formula import Atom
 
-DROP_DISTANCE = 0.05
-"""Displacement of a held object in the hand from which it counts as dropped, m."""
+DROP_DISTANCE = 0.05  # displacement of a held object in the hand from which it counts as dropped, m
 HAND_HOME = Atom("handhome", ())
-MAX_SETTLING_STEPS = 18
-"""Maximum number of control steps for settling at home."""
-HAND_HALF_WIDTH = 0.05
-"""Lateral extent of the hand in transit, m."""
+MAX_SETTLING_STEPS = 18  # maximum number of control steps for settling at home
+HAND_HALF_WIDTH = 0.05  # lateral extent of the hand in transit, m
 PRESS_STEPS = 2
 """Steps of pushing against a joint's stop. Fewer than the six steps a policy executes per plan; otherwise a policy that
 cannot observe the contact would plan them repeatedly."""
 RELEASE_GAP, MAX_RELEASE_STEPS = 0.004, 6
 """Increase of the finger opening at which an object is released, m, and largest number of steps waited for it."""
 
-FINGER_REACH = 0.0095
-"""Length of the finger tips below the grip site, m."""
-FINGER_THICKNESS = 0.014
-"""Thickness of a finger tip along the closing axis, m."""
-OPEN_WIDTH = 0.079
-"""Distance between the open fingers, m."""
+FINGER_REACH = 0.0095  # length of the finger tips below the grip site, m
+FINGER_THICKNESS = 0.014  # thickness of a finger tip along the closing axis, m
+OPEN_WIDTH = 0.079  # distance between the open fingers, m
 BLOCKED_DISTANCE, BLOCKED_COST = 0.010, 2.0
 """Horizontal distance between the centre of a finger tip and an object below which the finger collides with it, m, and
 the cost: policies would learn the failing grasp first."""
-HAND_MARGIN = 0.006
-"""Margin between the hand and other objects, m."""
+HAND_MARGIN = 0.006  # margin between the hand and other objects, m
 HAND_POINTS = np.array(
     [(x, y, -z) for x in (-0.1, -0.05, 0.0, 0.05, 0.1) for y in (-0.032, 0.0, 0.032) for z in (0.05, 0.08, 0.11)]
     + [(x, y, -z) for x in (-0.05, 0.0, 0.05) for y in (-0.05, 0.0, 0.05) for z in (0.14, 0.18)]
     + [(x, y, -0.105) for x in (-0.02, 0.02) for y in (-0.045, 0.045)]  # rim of the flange
 )
 """Points on palm and wrist in the grip site's frame (N, 3), m."""
-MAX_DRAWER_EXCESS = 0.022
-"""Largest height by which an object may exceed a drawer's region without blocking it, m."""
-TRAVEL_CLEARANCE = 0.025
-"""Vertical clearance over obstacles, m."""
+MAX_DRAWER_EXCESS = 0.022  # largest height by which an object may exceed a drawer's region without blocking it, m
+TRAVEL_CLEARANCE = 0.025  # vertical clearance over obstacles, m
 
 OBSTACLE_DISTANCE = 0.085
 """Horizontal distance from the grip site within which a tall obstacle affects the hand's lean, m."""
-MAX_LEAN = np.radians(32)
-"""Largest lean for obstacle avoidance or reach, rad."""
-MAX_LEAN_UNDER = np.radians(44)
-"""Largest lean for objects below an obstacle, rad."""
+MAX_LEAN = np.radians(32)  # largest lean for obstacle avoidance or reach, rad
+MAX_LEAN_UNDER = np.radians(44)  # largest lean for objects below an obstacle, rad
 DRAWER_LEAN = np.radians(14)
 """Lean in the opening direction inside a drawer: avoids the handles above and the drawer's front, rad."""
 LEAN_CANDIDATES = (0.0, 0.12, -0.12, 0.24, -0.24, 0.36, -0.36, 0.48, -0.48)
@@ -105,13 +94,10 @@ def protrudes_from_drawer(hand: Hand, name: str, region: str) -> bool:
 
 
 def region_box(hand: Hand, region: str) -> tuple[Array, Array, Array]:
-    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, with the third axis up.
-
-    The site frames of LIBERO's drawers have another axis up.
-    """
+    """Return centre (3,), rotation (3, 3) and half size (3,) of a region, with the third axis up."""
     centre, rotation = hand.sim.site_pose(region)
     half = hand.sim.site_half_size(region)
-    upright = int(np.argmax(np.abs(rotation[2])))
+    upright = int(np.argmax(np.abs(rotation[2])))  # another axis in the site frames of LIBERO's drawers
     if upright == 2:
         return centre, rotation, half
     order = [(upright + 1) % 3, (upright + 2) % 3, upright]
@@ -138,7 +124,6 @@ def obstacle_boxes(hand: Hand, name: str) -> list[tuple[Array, Array, Array]]:
 
 
 def _objects(hand: Hand, *but: str) -> Iterator[tuple[Asset, Array, Array]]:
-    """Yield objects with their positions (3,) and rotations (3, 3), except those of some names."""
     for name, asset in hand.sim.assets.items():
         if asset.kind == "object" and name not in but:
             yield asset, *hand.sim.asset_pose(name)
@@ -277,10 +262,8 @@ class Held:
     """A grasped object and its pose in the hand."""
 
     name: str
-    offset: Array
-    """Origin of the object in the hand's frame, (3,), m."""
-    turn: Array
-    """Rotation of the object in the hand's frame, (3, 3)."""
+    offset: Array  # origin of the object in the hand's frame, (3,), m
+    turn: Array  # rotation of the object in the hand's frame, (3, 3)
 
 
 def is_held(hand: Hand, held: Held) -> bool:
@@ -291,11 +274,8 @@ def is_held(hand: Hand, held: Held) -> bool:
 
 
 def sustained(reached: Callable[[], bool]) -> Callable[[], bool]:
-    """Return a condition, evaluated once per step, that is true after ``reached`` has held for `PRESS_STEPS` steps.
-
-    A policy that imitates the motion less exactly and stops some steps earlier still closes the joint.
-    """
-    count = 0
+    """Return a condition, evaluated once per step, that is true after ``reached`` has held for `PRESS_STEPS` steps."""
+    count = 0  # a policy that imitates the motion less exactly and stops some steps earlier still closes the joint
 
     def condition() -> bool:
         nonlocal count
@@ -354,18 +334,16 @@ def release_fixture(hand: Hand, height: float = 0.12) -> Steps:
     yield from hand.move(up, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, timeout=50)
 
 
-def release_object(hand: Hand, up: float = 0.12) -> Steps:
-    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it.
-
-    Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
-    """
+def release_object(hand: Hand) -> Steps:
+    """Move up while the fingers open: fully open inside a bowl they would press against its wall and lift it."""
+    # Before that the fingers leave the object: a rising pad hooks under the eaves of LIBERO's light milk carton.
     grip = hand.sim.gripper_opening()
     yield from hand.open(3)
     for _ in range(MAX_RELEASE_STEPS):
         if hand.sim.gripper_opening() > grip + RELEASE_GAP:
             break
         yield from hand.open(1)
-    target = hand.position + up * UP
+    target = hand.position + 0.12 * UP
     yield from hand.move(target, hand.rotation, OPEN, tolerance=0.02, turn_tolerance=1.0, speed=0.7, timeout=60)
 
 
@@ -376,10 +354,7 @@ def go_home(hand: Hand, position: Array, rotation: Array) -> Steps:
 
 
 def come_home(hand: Hand, position: Array, rotation: Array) -> Steps:
-    """Return to the home pose and come to rest there; a hand at home does not move.
-
-    Settling ends after `MAX_SETTLING_STEPS` steps.
-    """
+    """Return to the home pose and come to rest there; a hand at home does not move."""
     if hand.sim.holds(HAND_HOME):
         return
     yield from go_home(hand, position, rotation)

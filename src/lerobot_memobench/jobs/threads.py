@@ -1,12 +1,8 @@
 """Set the number of threads of this package's processes and their libraries.
 
-A rollout is sequential: a small policy, physics and both images use one core, and a second thread of torch or of the
-renderer only spins until the next step. So a process that simulates has one thread of each, and more cores mean more
-processes. Training and large policies multiply large matrices: they use all cores of their process, shared among this
-package's processes on the machine.
-
-`use_threads` sets environment variables before the libraries load; child processes inherit them. `limit_torch` sets
-torch's threads when a policy's size is known. Variables of the user are kept.
+A rollout is sequential: a second thread of torch or of the renderer only spins until the next step. So a process that
+simulates has one thread of each, and more cores mean more processes. Training and large policies multiply large
+matrices: they use all cores, shared among this package's processes. Variables of the user are kept.
 """
 
 from __future__ import annotations
@@ -14,7 +10,6 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -42,28 +37,29 @@ def cores() -> int:
 
 
 def torch_threads(role: str, processes: int = 1, *, large: bool = False) -> int | None:
-    """Return the number of torch's threads in each of so many processes; None: torch's default.
-
-    Args:
-        role: `ACTING` or `LEARNING`.
-        large: whether the acting policy has `LARGE` parameters or more.
-    """
+    """Return torch's threads in each of so many processes, for a policy of `LARGE` parameters or not; None: default."""
     if role == ACTING and not large:
         return 1
     if role == LEARNING and processes == 1 and cores() == len(_affinity()):
         return None  # torch's default uses affinity too, without hyperthreads
-    return max(1, min(cores(), physical_cores()) // processes)
+    siblings = set()  # hyperthreads of one physical core have the same list
+    for number in _affinity():
+        path = Path(f"/sys/devices/system/cpu/cpu{number}/topology/thread_siblings_list")
+        try:
+            siblings.add(path.read_text())
+        except OSError:
+            siblings.add(str(number))
+    return max(1, min(cores(), len(siblings)) // processes)
 
 
 def use_threads(role: str) -> None:
-    """Set this process's environment variables. Call it before numpy, torch or a renderer is loaded."""
+    """Set environment variables, which child processes inherit, before numpy, torch or a renderer is loaded."""
     environment = os.environ
     ours = set(filter(None, environment.get(CHOSEN_HERE, "").split(",")))
     wanted = dict(ONE_EACH)
     if not {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY"} & (environment.keys() - ours) and role == ACTING:
         wanted |= SPINNING
-    threads = torch_threads(role, sharing_processes())
-    if threads is not None:
+    if (threads := torch_threads(role, sharing_processes())) is not None:
         wanted[TORCH] = str(threads)
     chosen = {key: value for key, value in wanted.items() if key in ours or key not in environment}
     for key in ours - chosen.keys():
@@ -74,18 +70,13 @@ def use_threads(role: str) -> None:
 
 def limit_torch(parameters: int) -> None:
     """Set torch's threads in a process in which a policy of so many parameters acts."""
-    if is_users_own(TORCH):
-        return
+    if TORCH in os.environ and TORCH not in os.environ.get(CHOSEN_HERE, "").split(","):
+        return  # the user has set it
     import torch
 
     threads = torch_threads(ACTING, sharing_processes(), large=parameters >= LARGE)
     if threads is not None and threads != torch.get_num_threads():
         torch.set_num_threads(threads)
-
-
-def is_users_own(variable: str) -> bool:
-    """Return whether the user has set a variable of the environment."""
-    return variable in os.environ and variable not in os.environ.get(CHOSEN_HERE, "").split(",")
 
 
 def sharing_processes() -> int:
@@ -94,38 +85,23 @@ def sharing_processes() -> int:
     return int(text) if text.isdecimal() and int(text) else 1
 
 
-def sharing(processes: int, environment: Mapping[str, str] | None = None) -> dict[str, str]:
+def sharing(processes: int) -> dict[str, str]:
     """Return the environment of one of so many processes that share the cores."""
-    return {**(os.environ if environment is None else environment), PROCESSES: str(processes)}
+    return {**os.environ, PROCESSES: str(processes)}
 
 
 def _affinity() -> set[int]:
     """Return the numbers of the processors that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return os.sched_getaffinity(0)
-    return set(range(os.cpu_count() or 1))
-
-
-def physical_cores() -> int:
-    """Return the number of physical cores of this process."""
-    sibling_lists = set()
-    for number in _affinity():
-        path = Path(f"/sys/devices/system/cpu/cpu{number}/topology/thread_siblings_list")
-        try:
-            sibling_lists.add(path.read_text())
-        except OSError:
-            sibling_lists.add(str(number))
-    return len(sibling_lists)
+    return os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(os.cpu_count() or 1))
 
 
 def cpu_model() -> str:
     """Return the processor's name."""
-    try:  # platform.processor() names no model on Linux
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    with suppress(OSError):  # platform.processor() names no model on Linux
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def _quota() -> int | None:

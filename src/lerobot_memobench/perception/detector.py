@@ -5,30 +5,46 @@ detected on a map four times as fine, which a feature pyramid (Lin et al. 2017) 
 encoder's feature maps. Linear heads predict a heat map of the objects' visible centres (CenterNet, Zhou et al. 2019),
 their geometry and a mask. Linear heads confuse kinds if little of an object is visible, so a small network scores each
 peak of the heat map again by its surroundings, like the second stage of Faster R-CNN (Ren et al. 2015).
+
+A detector is one safetensors file with the names of its kinds.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
 from einops import rearrange
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
 from scipy.special import expit
 from torch import Tensor, nn
 from torch.nn.functional import max_pool2d, pad, relu
 
-from lerobot_memobench.perception.visual_encoder import GRID, ResidualBlock, VisualEncoder, fold_norms
+from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.io import write_file
+from lerobot_memobench.perception.visual_encoder import (
+    BLOCKS,
+    GRID,
+    WIDTHS,
+    ResidualBlock,
+    VisualEncoder,
+    fold_norms,
+)
 
-LEVELS = 2
-"""Levels of the feature pyramid, each twice as fine as the one before."""
-FINER = 2**LEVELS
-"""Cells of the finest map along a token's side."""
-FINE, COARSE = 4, 2
-"""Cells along a token's side: of heat map and mask, and of geometry."""
+logger = logging.getLogger(__name__)
+
+LEVELS = 2  # levels of the feature pyramid, each twice as fine as the one before
+FINER = 2**LEVELS  # cells of the finest map along a token's side
+FINE, COARSE = 4, 2  # cells along a token's side: of heat map and mask, and of geometry
 GEOMETRY = ("across", "down", "depth", "height", "joint", "lit", "turn cosine", "turn sine")
 """Values predicted for an object of each kind in each coarse cell. ``across``, ``down``: from the cell's centre to the
 object's origin, in cells. ``depth``: of its origin along the camera's view, m. ``height``: of its origin over the
@@ -36,41 +52,25 @@ table, m. ``joint``: of a moving part, m or rad. ``lit``: logit of a highlight a
 angle of its x axis in the image, which a half turn leaves as it is."""
 UNCERTAINTIES = ("place", "depth", "height")
 """Predicted expected errors: of ``across`` and ``down`` together in cells, of the others in m."""
-FIRST_UNCERTAINTIES = (0.3, 0.01, 0.01)
-"""Their values before training."""
-PRIOR = 0.01
-"""Probability of an object in a cell before training."""
+FIRST_UNCERTAINTIES = (0.3, 0.01, 0.01)  # before training
+PRIOR = 0.01  # probability of an object in a cell before training: most cells show none
 
-REFINEMENT_WIDTH, REDUCED_CHANNELS = 96, 24
-"""Width of the refinement head, and channels to which it reduces the encoder's feature map."""
+REFINEMENT_WIDTH, REDUCED_CHANNELS = 96, 24  # the refinement head reduces the encoder's feature map
 MAP_WINDOW, FEATURE_WINDOW = 5, 13
 """Side of the square around a peak that the refinement head reads: in cells of the finest map, and in cells of the
 encoder's feature map, which are half as wide."""
-LOGIT_SCALE = 4.0
-"""Divisor of heat map logits, about their standard deviation."""
+LOGIT_SCALE = 4.0  # about the standard deviation of heat map logits
 
 DETECTION = np.dtype(
-    [
-        ("kind", "u1"),
-        ("score", "<f4"),
-        ("place", "<f4", 2),
-        ("depth", "<f4"),
-        ("height", "<f4"),
-        ("joint", "<f4"),
-        ("lit", "<f4"),
-        ("turn", "<f4", 2),
-        ("uncertainty", "<f4", len(UNCERTAINTIES)),
-    ]
+    [("kind", "u1"), ("place", "<f4", 2), ("turn", "<f4", 2), ("uncertainty", "<f4", len(UNCERTAINTIES))]
+    + [(name, "<f4") for name in ("score", "depth", "height", "joint", "lit")]
 )
 """A detected object. ``score``: probability. ``place``: of its origin in the image, fractions of the side from the
 upper left corner. ``lit``: probability. ``uncertainty``: expected error of its place, a fraction of the image's side,
 of its depth and of its height, m; 0 if it is not predicted. The others as in `GEOMETRY`."""
-Detections = NDArray[np.void]
-"""Detections (n,) of one image, of dtype `DETECTION`."""
-MIN_SCORE, MIN_HEAT = 0.03, 0.3
-"""Smallest score of a detection: with refinement, and without, because the heat map alone is overconfident."""
-MAX_DETECTIONS = 64
-"""Largest number of detections in an image."""
+Detections = NDArray[np.void]  # detections (n,) of one image, of dtype `DETECTION`
+MIN_SCORE = 0.03  # smallest score of a detection
+MAX_DETECTIONS = 64  # in an image
 
 CellQuery = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 """Maps image, kind, row and column of coarse cells, (n,) each, to (n, values), float32: predictions for an object of
@@ -132,7 +132,7 @@ class FeaturePyramid(nn.Module):
         self.levels = nn.ModuleList(PyramidLevel(*pair) for pair in pairwise(widths))
 
     def forward(self, tokens: Tensor, maps: Sequence[Tensor]) -> Tensor:
-        """Return (N, (GRID FINER)², width), row by row."""
+        """Return the finest map (N, (GRID FINER)², width), row by row."""
         x = tokens.unflatten(1, (GRID, GRID))
         for level, lateral in zip(self.levels, reversed(maps), strict=False):  # the finest maps are left over
             x = level(x, lateral)
@@ -156,11 +156,7 @@ class PyramidLevel(nn.Module):
 
 
 class Heads(nn.Module):
-    """Linear maps from tokens, or cells of a map, to a `DetectorOutput`.
-
-    Args:
-        width: of a token. grid: side of the square of tokens. fine, coarse: cells along a token's side.
-    """
+    """Linear maps from ``grid`` x ``grid`` tokens, or cells of a map, to a `DetectorOutput`."""
 
     def __init__(
         self, width: int, kinds: int, grid: int, fine: int = FINE, coarse: int = COARSE, *, uncertain: bool = False
@@ -205,11 +201,7 @@ class Heads(nn.Module):
 
 
 class RefinementHead(nn.Module):
-    """Score the peaks of a heat map by their surroundings.
-
-    Args:
-        width: of the finest map. channels: of the encoder's feature map, twice as fine.
-    """
+    """Score the peaks of a heat map by their surroundings in the finest map and in a feature map, twice as fine."""
 
     def __init__(self, width: int, channels: int, kinds: int) -> None:
         super().__init__()
@@ -237,22 +229,19 @@ class RefinementHead(nn.Module):
 
 
 def _squares(maps: Tensor, side: int, step: int) -> Tensor:
-    """Return zero-padded squares around every ``step``-th cell of maps (N, C, H, W), (N, C, H', W', side, side)."""
+    # (N, C, H, W) to zero-padded squares around every step-th cell, (N, C, H', W', side, side)
     return pad(maps.float(), (side // 2,) * 4).unfold(2, side, step).unfold(3, side, step)
 
 
 def detections(output: DetectorOutput) -> list[Detections]:
-    """Return the detections of each image, highest score first.
-
-    Their scores are above `MIN_SCORE`, or above `MIN_HEAT` without refinement.
-    """
+    """Return the detections of each image with scores above `MIN_SCORE`, highest first."""
     scores, cells = peaks(output)
     scores, order = scores.sort(dim=1, descending=True, stable=True)
-    which, rank = torch.nonzero(scores > (MIN_HEAT if output.score is None else MIN_SCORE), as_tuple=True)
+    which, rank = torch.nonzero(scores > MIN_SCORE, as_tuple=True)
     image, kind, row, column = (cell.gather(1, order)[which, rank] for cell in cells)
 
     def in_image(image: Tensor, kind: Tensor, row: Tensor, column: Tensor) -> Tensor:
-        """Query geometry with places in the image, fractions of its side, instead of offsets from cells."""
+        # Offsets from different cells cannot be interpolated, places in the image can.
         offset, rest = output.geometry(image, kind, row, column).split([2, len(GEOMETRY) - 2], dim=1)
         return torch.cat([(offset + torch.stack([column, row], dim=1) + 0.5) / output.side, rest], dim=1)
 
@@ -293,7 +282,7 @@ def peaks(output: DetectorOutput) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor,
 def _interpolated(
     query: CellQuery, side: int, image: Tensor, kind: Tensor, down: Tensor, across: Tensor
 ) -> NDArray[np.float32]:
-    """Return values (n, values) at places between cells, interpolated bilinearly."""
+    # Bilinear, from at most four cells of each object: `grid_sample` would need predictions in all cells.
     y, x = down * side - 0.5, across * side - 0.5
     total = weights = torch.zeros(len(y), 1)
     for row, column in ((y.floor() + a, x.floor() + b) for a in (0, 1) for b in (0, 1)):
@@ -302,3 +291,65 @@ def _interpolated(
         cell = (row.long().clamp(0, side - 1), column.long().clamp(0, side - 1))
         total, weights = total + weight * query(image, kind, *cell).detach(), weights + weight
     return np.asarray((total / weights).numpy())
+
+
+# --- files ---
+
+PACKAGE, SHIPPED = "package", Path(__file__).parent / "detector.safetensors"
+"""Name and file of the package's detector, trained on the scenes that version 0.2 modelled in code."""
+
+
+def save_detector(detector: Detector, path: Path) -> None:
+    """Fold a detector and write it to a file, in bfloat16."""
+    detector.fold()
+    tensors = {name: value.detach().to(torch.bfloat16).contiguous() for name, value in detector.state_dict().items()}
+    shape = {"widths": detector.encoder.widths, "blocks": detector.encoder.blocks, "kinds": detector.kinds}
+    write_file(path, save(tensors, {"detector": json.dumps(shape)}))
+
+
+def load_detector(name: str | Path) -> Detector:
+    """Return the detector of `PACKAGE` or a path in float32 and in evaluation mode; warn about the package's."""
+    path = detector_file(name)
+    if path == SHIPPED:
+        warn_of_former_scenes()
+    try:
+        with safe_open(path, framework="pt") as file:
+            shape = json.loads(file.metadata()["detector"])
+            detector = Detector(VisualEncoder(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
+            detector.fold()
+            # The package's file also holds heads that only its training used.
+            detector.load_state_dict({key: file.get_tensor(key).float() for key in detector.state_dict()})
+    except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise MemobenchError(
+            f"{path} holds no detector ({reason}); name a file of `python -m research.detector train`"
+        ) from None
+    return detector.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+@cache
+def warn_of_former_scenes() -> None:
+    """Log once per process that the package's detector was trained on other scenes."""
+    logger.warning(
+        "the package's detector and visual encoder were trained on the scenes of version 0.2, whose objects looked "
+        "different; train one for this version's with `python -m research.detector train` and name its file"
+    )
+
+
+def load_visual_encoder(name: str) -> VisualEncoder:
+    """Return the visual encoder of the detector of `PACKAGE` or a path; refuse one of other sizes than policies use."""
+    encoder = load_detector(name).encoder
+    if (encoder.widths, encoder.blocks) != (WIDTHS, BLOCKS):
+        raise MemobenchError(
+            f"the visual encoder of {name} has stages of widths {encoder.widths} and blocks {encoder.blocks}, and "
+            f"policies use {WIDTHS} and {BLOCKS}; name a file of this version's `python -m research.detector train`"
+        )
+    return encoder
+
+
+def detector_file(name: str | Path) -> Path:
+    """Return the file of the detector of `PACKAGE` or a path; refuse one that does not exist."""
+    path = SHIPPED if str(name) == PACKAGE else Path(name).expanduser()
+    if not path.is_file():
+        raise MemobenchError(f"there is no file {path}; name one that `python -m research.detector train` has written")
+    return path

@@ -39,39 +39,33 @@ View = Mapping[str, Array] | NDArray[np.void]
 -z; ``slope`` (...) tangent of half its field of view."""
 
 WRIST_POSITION = (0.05, 0.0, -0.097)
-"""The wrist camera's position in the hand's frame, from between the finger tips, m."""
 WRIST_ROTATION = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
-"""Its rotation in the hand's frame."""
-ANGLES = {"agentview": AGENTVIEW_ANGLE, "wrist": 75.0}
-"""Fields of view, degrees."""
+"""The wrist camera's pose in the hand's frame, from between the finger tips, m."""
+ANGLES = {"agentview": AGENTVIEW_ANGLE, "wrist": 75.0}  # fields of view, degrees
 
 DRAWERS = ("top_drawer", "middle_drawer", "bottom_drawer")
 """Each drawer is a kind of its own: drawers are closer together than two objects of one kind that can be separated."""
-PARTS = (*DRAWERS, "door", "knob")
-"""Kinds that have a joint; their indices come first."""
+PARTS = (*DRAWERS, "door", "knob")  # kinds that have a joint; their indices come first
 ONE = frozenset({*PARTS, "flat_stove", "kitchen_table", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"})
 """Kinds with one object per scene."""
 FACING = {"flat_stove": 0.0, "knob": pi / 2} | dict.fromkeys(
     ("drawer", "door", "microwave", "wooden_cabinet", "wooden_two_layer_shelf"), pi
 )
 """Class of fixture or part -> angle of its x axis in the world, as tasks place it and at joint position 0, rad."""
-MIN_SCORE_ALONE = 0.1
-"""Smallest score of a detection by one camera alone."""
+MIN_SCORE_ALONE = 0.1  # of a detection by one camera alone
 APART, SAME = 0.03, 0.04
 """Smallest distance of two objects of a kind, and largest distance of two cameras' detections of one object, m."""
-LIT = 0.5
-"""Smallest probability of a highlighted object."""
+LIT = 0.5  # smallest probability of a highlighted object
 WRIST_RANGE = 0.2
 """Depth up to which the wrist camera may give an object's rotation more precisely than the other camera, m."""
-LEAST_ERROR = 0.0005
-"""Lower bound of expected errors of positions, m."""
+LEAST_ERROR = 0.0005  # m; keeps precisions finite
 
 
 # -- geometry of the cameras -------------------------------------------------------------------------------------------
 
 
 def views_of(state: NDArray[np.floating]) -> dict[str, View]:
-    """Return the views of both cameras for a robot state (>= 6,): the hand's position and axis-angle rotation."""
+    """Return both cameras' views for a robot state (>= 6,): the hand's position, m, and axis-angle rotation, rad."""
     slope = {camera: np.tan(np.radians(angle) / 2) for camera, angle in ANGLES.items()}
     fixed = Rotation.from_quat(AGENTVIEW_QUATERNION, scalar_first=True).as_matrix()
     hand = Rotation.from_rotvec(np.asarray(state[3:6], np.float64)).as_matrix()
@@ -82,18 +76,6 @@ def views_of(state: NDArray[np.floating]) -> dict[str, View]:
     }
 
 
-def projected(positions: Array, view: View) -> tuple[Array, Array]:
-    """Project points (..., 3) of the world: places (..., 2) in the image, and depths (...) along the view, m.
-
-    Places are fractions of the image's side, x to the right and y down, from its upper left corner.
-    """
-    local = np.einsum("...ij,...i->...j", view["turned"], positions - view["eye"])
-    depth = -local[..., 2]
-    # Points in the camera's plane have no place; the bound keeps theirs finite.
-    reach = np.maximum(np.abs(depth), 1e-3) * view["slope"]
-    return np.stack([1 + local[..., 0] / reach, 1 - local[..., 1] / reach], axis=-1) / 2, depth
-
-
 def rays(places: Array, view: View) -> Array:
     """Return the lines of sight (..., 3) in the world through places (..., 2), of depth one along the camera's view."""
     slope = np.asarray(view["slope"])
@@ -102,41 +84,28 @@ def rays(places: Array, view: View) -> Array:
     return np.asarray(np.einsum("...ij,...j->...i", view["turned"], local))
 
 
-def depth_at_height(sight: Array, height: Array, view: View) -> Array:
-    """Return the depth (...) at which lines of sight (..., 3) meet a height; very large if they point up."""
-    return np.asarray((height - view["eye"][2]) / np.minimum(sight[..., 2], -1e-3))
-
-
 # -- objects -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class DetectedObject:
-    """An object, by the detections of one camera or of both.
-
-    Attributes:
-        depth: from the camera that placed it, m. position: of its origin in the world, m.
-        precision: (3, 3) inverse covariance of the position, 1/m². axis: (3,) its x axis or the opposite one, level.
-        joint: m or rad. lit: probability of a highlight around it.
-    """
+    """An object, by the detections of one camera or of both."""
 
     kind: int
     score: float
     cameras: tuple[str, ...]
-    depth: float
-    position: Array
-    precision: Array
-    axis: Array
-    joint: float
-    lit: float
+    depth: float  # from the camera that placed it, m
+    position: Array  # of its origin in the world, m
+    precision: Array  # (3, 3) inverse covariance of the position, 1/m²
+    axis: Array  # (3,) its x axis or the opposite one, level
+    joint: float  # m or rad
+    lit: float  # probability of a highlight around it
 
     def merge(self, other: DetectedObject, unique: bool) -> None:
-        """Merge the detection of another camera with a lower score; ``unique``: a scene has one object of this kind.
-
-        Positions are averaged by their precisions, along each line of sight and across. The rotation is that of the
-        higher score, except the wrist camera's from a large distance. The origins of fixtures and their parts are
-        outside the wrist camera's image, so the other camera alone places them.
-        """
+        """Merge the detection of another camera with a lower score; ``unique``: a scene has one object of this kind."""
+        # Positions are averaged by their precisions. The rotation is that of the higher score, except the wrist
+        # camera's from a large distance. The origins of fixtures and their parts, unique kinds, are outside the wrist
+        # camera's image, so the other camera alone places them.
         outside = other if self.cameras[0] == "wrist" else self
         self.cameras += other.cameras
         self.lit = max(self.lit, other.lit)
@@ -160,9 +129,7 @@ class ObjectLocalizer:
     def __call__(self, images: Mapping[str, Tensor], states: Tensor) -> Tensor:
         """Return object slots (N, `object_slots.SIZE`), float32.
 
-        Args:
-            images: of each camera, (N, 3, H, H) in [0, 1].
-            states: (N, >= 6) the hand's position, m, and its rotation as axis times angle, rad.
+        ``images`` of each camera are (N, 3, H, H) in [0, 1]; ``states`` (N, >= 6) are as for `views_of`.
         """
         both = torch.cat([area_averaged(images[camera]) for camera in MJCF_CAMERAS])  # one pass is faster than two
         detected = detections(self.detector(both))
@@ -213,8 +180,9 @@ class ObjectLocalizer:
         if camera == "wrist":
             depth, along = float(detection["depth"]), depth_error
         else:
-            depth = float(depth_at_height(sight, TABLE_TOP + detection["height"], view))
-            along = height_error / max(-sight[2], 1e-3)
+            down = max(-sight[2], 1e-3)  # a line of sight that points up meets the height very far away
+            depth = float((view["eye"][2] - (TABLE_TOP + detection["height"])) / down)
+            along = height_error / down
             axis = axis - turned[:, 2] * (axis[2] / turned[2, 2])  # the axis is level, the image is not
         return DetectedObject(
             int(detection["kind"]),
@@ -258,7 +226,7 @@ def upright(slots: Tensor) -> Tensor:
 
 @cache
 def _classes() -> Tensor:
-    """Return each class's angle of `FACING`, and whether it is round and whether its y axis points up, (classes, 3)."""
+    # (classes, 3): angle of `FACING`, whether it is round, whether its y axis points up
     rows = []
     for name in classes():
         known = CLASSES.get(name, UNKNOWN_CLASS)

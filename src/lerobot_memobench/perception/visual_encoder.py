@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import torch
 from einops import rearrange
 from torch import Tensor, nn
@@ -10,22 +12,15 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from lerobot_memobench.errors import MemobenchError
 
-SIDE = 256
-"""Side of the encoder's images, pixels: the benchmark's own."""
-GRID, POOLED = 8, 4
-"""Sides of the squares of tokens."""
-WIDTH = 192
-"""Dimension of a token."""
+SIDE = 256  # side of the encoder's images, pixels: the benchmark's own
+GRID, POOLED = 8, 4  # sides of the squares of tokens
+WIDTH = 192  # dimension of a token
 WIDTHS, BLOCKS = (16, 24, 48, 96, WIDTH), (0, 0, 2, 3, 1)
 """Channels of each stage, which halves the image, and its residual blocks."""
 
 
 def area_averaged(images: Tensor) -> Tensor:
-    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging.
-
-    Raises:
-        MemobenchError: the images are not square.
-    """
+    """Return square images (N, 3, H, H) at the encoder's size, float (N, 3, SIDE, SIDE), by area averaging."""
     height, width = images.shape[-2:]
     if height != width:
         raise MemobenchError(
@@ -62,17 +57,9 @@ class ResidualBlock(nn.Module):
 
 
 class VisualEncoder(nn.Module):
-    """A small convolutional network from images to tokens.
+    """A small convolutional network to tokens: stages of ``widths`` channels, with ``blocks`` residual blocks each."""
 
-    Args:
-        widths: channels of each stage; the last is the dimension of a token.
-        blocks: residual blocks of each stage.
-        folded: without batch normalisation, as in the file of `weights`.
-    """
-
-    def __init__(
-        self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = BLOCKS, *, folded: bool = False
-    ) -> None:
+    def __init__(self, widths: tuple[int, ...] = WIDTHS, blocks: tuple[int, ...] = BLOCKS) -> None:
         super().__init__()
         self.widths, self.blocks, self.width = widths, blocks, widths[-1]
         self.stages = nn.ModuleList(
@@ -82,8 +69,6 @@ class VisualEncoder(nn.Module):
         self.grid_position = nn.Parameter(torch.zeros(widths[-1], GRID, GRID))
         self.decorrelate: nn.Module = nn.Identity()
         self.pool = nn.Linear(widths[-1] * (GRID // POOLED) ** 2, widths[-1])
-        if folded:
-            self.fold()
 
     def forward(self, images: Tensor) -> Tensor:
         """Return the tokens (N, 64, width) of images (N, 3, SIDE, SIDE) in [0, 1], row by row."""
@@ -104,16 +89,17 @@ class VisualEncoder(nn.Module):
         near = rearrange(tokens, "n (y b x a) d -> n (y x) (b a d)", b=2, a=2, y=POOLED, x=POOLED)
         return self.pool(near)
 
-    def fold(self) -> None:
-        """Fold batch normalisation into the convolutions and add the linear map that whitens tokens, as identity.
+    def fold(self) -> Self:
+        """Fold batch normalisation into the convolutions, and add the linear map that whitens tokens, as identity.
 
-        The outputs in evaluation mode do not change. A folded encoder cannot be trained further.
+        Outputs in evaluation mode do not change. A folded encoder, as in a detector's file, is not trained further.
         """
         fold_norms(self)
         if isinstance(self.decorrelate, nn.Identity):
             self.decorrelate = nn.Linear(self.width, self.width)
             nn.init.eye_(self.decorrelate.weight)
             nn.init.zeros_(self.decorrelate.bias)
+        return self
 
 
 def fold_norms(module: nn.Module) -> None:

@@ -16,7 +16,6 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
-    PolicyAction,
     PolicyProcessorPipeline,
     RenameObservationsProcessorStep,
     make_policy_processor_pipelines,
@@ -43,14 +42,13 @@ class UntrainedConfig(PreTrainedConfig):
     reward_delta_indices: ClassVar[None] = None
 
     def get_optimizer_preset(self) -> AdamWConfig:
-        """Return a preset, which LeRobot needs before it builds the policy; ``forward`` refuses to train."""
-        return AdamWConfig()
+        return AdamWConfig()  # LeRobot needs one before it builds the policy, whose ``forward`` refuses to train
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        """No schedule."""
+        return None
 
     def validate_features(self) -> None:
-        """Accept the environment's features."""
+        pass  # the environment's are accepted
 
 
 class UntrainedPolicy(PreTrainedPolicy):
@@ -61,11 +59,9 @@ class UntrainedPolicy(PreTrainedPolicy):
     why_not_trained: ClassVar[str] = "has no parameters and cannot be trained"
 
     def get_optim_params(self) -> list[nn.Parameter]:
-        """Return no parameters."""
         return []
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict | None]:
-        """Refuse to train."""
         raise MemobenchError(
             f"the policy '{self.name}' {self.why_not_trained}; choose another policy, for example "
             "--policy.type=memobench_mem"
@@ -76,15 +72,12 @@ class UntrainedPolicy(PreTrainedPolicy):
         return False
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return a chunk of one action, (B, 1, 7)."""
         return self.select_action(batch).unsqueeze(1)
 
 
 def make_processors(
-    config: UntrainedConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
-]:
+    config: UntrainedConfig, dataset_stats: dict[str, Any] | None = None
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Return pre- and postprocessor that rename, batch and move to the policy's device, without normalisation."""
     return make_policy_processor_pipelines(
         input_steps=[
@@ -115,21 +108,17 @@ class MemobenchBlindConfig(MemobenchExpertConfig):
 
 
 class MemobenchExpertPolicy(UntrainedPolicy):
-    """The scripted expert: ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32.
-
-    Attributes:
-        offered: name of the environment's setting and of the observation that holds the action.
-    """
+    """The scripted expert: ``select_action`` returns ``batch["observation.expert_action"]``, (B, 7) float32."""
 
     config_class = MemobenchExpertConfig
     name = "memobench_expert"
     offered: ClassVar[str] = "expert_action"
+    """Name of the environment's setting and of the observation that holds the action."""
 
     def reset(self) -> None:
-        """Do nothing: the state of the expert is in the environment."""
+        pass  # the state of the expert is in the environment
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the action (B, 7) in [-1, 1] in the observation; refuse one of an environment without ``offered``."""
         key = f"observation.{self.offered}"
         if key not in batch:
             raise MemobenchError(
@@ -177,8 +166,7 @@ class MemobenchRandomConfig(UntrainedConfig):
 class MemobenchRandomPolicy(UntrainedPolicy):
     """Uniform random actions, the floor of every result: ``select_action`` draws (B, 7) float32 in [-1, 1].
 
-    One generator is used for all rows and rollouts. The same command with the same batch size repeats its actions, and
-    the rollouts of a run differ.
+    One generator draws for all rows and rollouts, so the rollouts of a run differ.
     """
 
     config_class = MemobenchRandomConfig
@@ -192,11 +180,9 @@ class MemobenchRandomPolicy(UntrainedPolicy):
         self.reset()
 
     def reset(self) -> None:
-        """Clear the last action, so that smoothing does not carry it into the next rollout; the generator continues."""
-        self._last: Tensor | None = None
+        self._last: Tensor | None = None  # smoothing must not carry it into the next rollout
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the next action (B, 7) in [-1, 1], one row per environment of ``batch``."""
         rows = next(value for value in batch.values() if isinstance(value, Tensor) and value.ndim)
         draw = torch.rand(rows.shape[0], ACTION_DIM, generator=self._generator) * 2 - 1
         if self._last is not None and self._last.shape == draw.shape:

@@ -1,4 +1,4 @@
-"""Find checkpoints of trained policies, and check that they are complete, of the expected type, and name no code.
+"""Find, check and identify trained policies: their checkpoints and their configurations.
 
 LeRobot imports and calls any ``class`` that a checkpoint's processor names, so its steps are checked before it builds
 them. Each check raises `MemobenchError`. A source is a checkpoint folder, or a repository, whose files are fetched when
@@ -8,14 +8,20 @@ they are read.
 from __future__ import annotations
 
 import copy
+import hashlib
+import json
+import logging
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NotRequired, TypedDict
 
 from lerobot_memobench.constants import CLOCK
+from lerobot_memobench.envs.evaluation_file import Acting
+from lerobot_memobench.envs.observations import policy_inputs
+from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.io import LONGEST_NAME, file_name
+from lerobot_memobench.io import LONGEST_NAME, file_hash, file_name
 from lerobot_memobench.untrusted import Count, check_fetched, refusing
 from lerobot_memobench.untrusted import read_json as read_json_file
 
@@ -23,14 +29,11 @@ if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
 
 # LeRobot's names of the files in a checkpoint.
-CONFIG_FILE = "config.json"
-TRAIN_CONFIG = "train_config.json"
-WEIGHTS_FILE = "model.safetensors"
-ADAPTER_FILE = "adapter_model.safetensors"
+CONFIG_FILE, TRAIN_CONFIG = "config.json", "train_config.json"
+WEIGHTS_FILE, ADAPTER_FILE = "model.safetensors", "adapter_model.safetensors"
+PREPROCESSOR_FILE, POSTPROCESSOR_FILE = "policy_preprocessor.json", "policy_postprocessor.json"
 CHECKPOINTS, LAST = "checkpoints", "last"
 """LeRobot's folder of a training run's checkpoints, and its link to the last one."""
-PREPROCESSOR_FILE = "policy_preprocessor.json"
-POSTPROCESSOR_FILE = "policy_postprocessor.json"
 RENAMING = "rename_observations_processor"
 """LeRobot's processor step that gives observations the names of a policy."""
 RANDOM_IF_MISSING = ("pi0", "pi05", "pi0_fast")
@@ -47,6 +50,19 @@ REMOTE_CODE = {
 }
 """Settings of LeRobot's steps that run the Python code of a repository -> LeRobot's values."""
 ADVICE = "copy or train the checkpoint again"
+NOT_THE_CHECKPOINT = (
+    *("train_config.json", "README.md", "training_weights.safetensors", ".gitattributes"),
+    *("training_curve.png", "training_curve.json"),
+)
+"""Files of a checkpoint folder that do not affect the policy's actions."""
+ELSEWHERE = (
+    *("device", "pretrained_path", "repo_id", "private", "tags", "license", "push_to_hub", "use_peft"),
+    *("host", "port", "servers", "connect_timeout", "timeout"),
+)
+"""Settings of where a policy runs or is published; its actions do not depend on them."""
+LONGEST, LARGEST = 100_000, 10_000_000
+"""Largest number of control steps or tokens of a policy, and largest other number of its configuration."""
+LENGTHS = ("chunk_size", "horizon", "memory_settings.frames", "n_action_steps", "n_obs_steps", "tokenizer_max_length")
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the trained policies that come with the package, each in a folder of its name."""
 
@@ -54,13 +70,9 @@ SHIPPED = Path(__file__).parent / "shipped"
 # --- the parts of LeRobot's files that are read ---
 
 
-class _Feature(TypedDict, total=False):
-    type: str
-
-
 class _StepConfig(TypedDict, total=False):
     norm_map: dict[str, str]
-    features: dict[str, _Feature]
+    features: dict[str, dict[str, Any]]
     rename_map: dict[str, str]
 
 
@@ -112,7 +124,12 @@ def checkpoint_folder(text: str) -> Path | None:
     """
     if text in (shipped := shipped_policies()):
         return shipped[text]
-    base = _through_last(Path(text).expanduser())
+    base = Path(text).expanduser()
+    for last in (base, base.parent):  # of a copy that lost the link
+        if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
+            named = checkpoints_of(last.parent.parent)[:1]
+            base = named[0] / base.relative_to(last) if named else base
+            break
     folders = (base, *(checkpoint / "pretrained_model" for checkpoint in (base, *checkpoints_of(base))))
     return next((folder for folder in folders if (folder / CONFIG_FILE).is_file()), None)
 
@@ -127,15 +144,6 @@ def checkpoints_of(run: Path) -> list[Path]:
     numbered.sort(key=lambda path: int(path.name), reverse=True)
     latest = [last] if last.is_dir() else [path for path in numbered if path.name == text_of_link(last)]
     return [*latest, *numbered]
-
-
-def _through_last(path: Path) -> Path:
-    """Replace ``checkpoints/last`` in a path by the checkpoint that it named, if a copy lost the link."""
-    for last in (path, path.parent):
-        if (last.parent.name, last.name) == (CHECKPOINTS, LAST) and not last.is_dir():
-            checkpoints = checkpoints_of(last.parent.parent)
-            return checkpoints[0] / path.relative_to(last) if checkpoints else path
-    return path
 
 
 def text_of_link(path: Path) -> str | None:
@@ -213,10 +221,7 @@ def check_checkpoint(path: str) -> None:
 
 
 def check_processor_statistics(source: str | Path, revision: str | None = None) -> None:
-    """Refuse processors without the statistics of the training data.
-
-    Their policy would run on raw numbers and score 0 % without any message.
-    """
+    """Refuse processors without the statistics of the training data, which would run on raw numbers and score 0 %."""
     for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE):
         file = checkpoint_file(source, name, revision)
         if file is None:
@@ -226,19 +231,13 @@ def check_processor_statistics(source: str | Path, revision: str | None = None) 
             )
         for step in filter(_normalises, processor_steps(file)):
             state = step.get("state_file")
-            known: dict[str, Any] = {}
-            if state is not None:
-                path = checkpoint_file(source, file_name(state, f"state_file in {file}"), revision)
-                if path is None:
-                    raise MemobenchError(
-                        f"the checkpoint {source} lacks its normalisation statistics ({state} is missing); copy the "
-                        "whole checkpoint or train it again"
-                    )
-                known = _shapes(path)
+            named = None if state is None else file_name(state, f"state_file in {file}")
+            path = None if named is None else checkpoint_file(source, named, revision)
+            known = () if path is None else _shapes(path)
             missing = [
                 key for key in _normalised(step, name) if not any(saved.startswith(f"{key}.") for saved in known)
             ]
-            if missing:
+            if missing or (state is not None and path is None):
                 raise MemobenchError(
                     f"the checkpoint {source} has no normalisation statistics for {', '.join(missing)} "
                     f"({state or name}), and would act on raw numbers; copy the whole checkpoint or train it again"
@@ -295,7 +294,7 @@ def _registered(name: str, kind: str | None) -> type | None:
     from lerobot.processor import ProcessorStepRegistry
 
     with suppress(Exception):  # packages of the policy may be missing
-        get_policy_class(str(kind))
+        get_policy_class(str(kind))  # registers its steps
     with suppress(KeyError):
         return ProcessorStepRegistry.get(name)
     return None
@@ -323,9 +322,8 @@ def _naming(value: Any) -> Iterator[str]:
 def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
     """Refuse weights that are incomplete, or of other shapes than the configuration sets.
 
-    LeRobot allocates the configured shapes, and continues with random numbers if weights are missing. The weights are
-    compared with a policy on the meta device. A policy that cannot be built there (its parts come from the hub) is not
-    checked.
+    LeRobot continues with random numbers if weights are missing. The weights are compared with a policy on the meta
+    device. A policy that cannot be built there (its parts come from the hub) is not checked.
     """
     if policy.use_peft:
         return
@@ -355,10 +353,7 @@ def check_weights(path: str | Path, policy: PreTrainedConfig, revision: str | No
 
 
 def check_as_trained(source: str | Path, policy: PreTrainedConfig, revision: str | None = None) -> None:
-    """Refuse other settings of a checkpoint than those it was trained with.
-
-    The class of its configuration lists them in ``fixed_by_training: ClassVar[tuple[str, ...]]``.
-    """
+    """Refuse other values of the settings ``fixed_by_training`` (an attribute of the configuration's class)."""
     fixed = getattr(policy, "fixed_by_training", ())
     for name, value, trained in differing(policy, as_trained(source, policy, revision), fixed) if fixed else ():
         raise MemobenchError(
@@ -434,10 +429,7 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
 
 
 def statistics_shapes(source: str | Path) -> dict[str, tuple[int, ...]]:
-    """Return name -> shape of the observations and actions that a policy was trained on; {} without statistics.
-
-    The configuration of a policy that began with another checkpoint may list that checkpoint's features instead.
-    """
+    """Return name -> shape of the observations and actions that a policy was trained on; {} without statistics."""
     file = _file_of(source, PREPROCESSOR_FILE)
     names = [step.get("state_file") for step in filter(_normalises, processor_steps(file))]
     states = [_file_of(source, file_name(name, f"state_file in {file}")) for name in names if name]
@@ -496,3 +488,112 @@ def _file_of(path: str | Path, name: str, revision: str | None = None) -> Path |
     with suppress(MemobenchError):  # LeRobot reports that it cannot be downloaded
         return checkpoint_file(path, name, revision)
     return None
+
+
+# --- configurations ---
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Suppress LeRobot's log lines about plugins and configurations; the run logs them again."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
+
+
+def encoded_config(policy: Any) -> dict[str, Any]:
+    """Return a policy's configuration as plain JSON values."""
+    import draccus
+
+    values = json.loads(json.dumps(draccus.encode(policy), default=str))
+    assert isinstance(values, dict)
+    return {**values, "type": policy.type}
+
+
+def check_sizes(policy: Any) -> None:
+    """Refuse a policy whose configuration has a length or a size that no machine can allocate."""
+    for name, value in _integers(encoded_config(policy)):
+        most = LONGEST if name in LENGTHS else None if name.startswith("scheduler_") or "seed" in name else LARGEST
+        if most is not None and value > most:
+            raise MemobenchError(f"found policy.{name}={value}; expected at most {most}")
+
+
+def _integers(value: Any, name: str = "") -> Iterator[tuple[str, int]]:
+    """Yield dotted name and value of the whole numbers in an encoded configuration."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _integers(item, f"{name}.{key}".lstrip("."))
+    elif isinstance(value, int):
+        yield name, value
+
+
+def has_device(device: str) -> bool:
+    """Return whether this machine has a device of torch, such as ``cuda:1``."""
+    import torch
+    from lerobot.utils.device_utils import is_torch_device_available
+
+    try:
+        torch_device = torch.device(device)
+        available = is_torch_device_available(torch_device.type)
+    except (RuntimeError, ValueError):  # there is no such type
+        return False
+    return available and (torch_device.type != "cuda" or (torch_device.index or 0) < torch.cuda.device_count())
+
+
+def check_device(device: str | None) -> None:
+    """Refuse a device that the user names and the machine lacks; LeRobot would run on another one."""
+    if device is not None and device not in ("", "null", "~") and not has_device(device):
+        raise MemobenchError(
+            f"this machine has no device {device!r} that torch can use; leave the device out to use the best one, or "
+            "name cpu"
+        )
+
+
+# --- identity ---
+
+
+def acting(policy: Any, path: str | None, settings: EnvSettings) -> Acting:
+    """Return the description of a policy (its configuration, and its checkpoint or None) for the evaluation's file."""
+    inputs = policy_inputs(policy, settings.obs_type, settings.oracle_memory)
+    weights, hashed = path, dict[str, str]()
+    if path is not None and Path(path).is_dir():
+        weights = hashed["sha256"] = tree_hash(checkpoint_files(Path(path)))
+    elif path is not None and (folder := cached_folder(path)) is not None:
+        weights = f"{path}@{folder.name}"  # the commit in the hub's cache
+    return Acting({"type": policy.type, "identity": identity_of(policy, path, weights), **hashed}, inputs)
+
+
+def identity_of(policy: Any, path: str | None, weights: str | None) -> str:
+    """Return a policy's type and one hash over its checkpoint's hash and the settings that differ from it."""
+    from lerobot.configs import PreTrainedConfig
+
+    default = policy
+    with quiet():
+        if path is not None:
+            default = PreTrainedConfig.from_pretrained(path)
+        else:
+            with suppress(TypeError):  # a plugin with a required setting
+                default = type(policy)()
+    before = encoded_config(default)
+    changes = {
+        key: file_hash(Path(value)) if isinstance(value, str) and Path(value).is_file() else value
+        for key, value in encoded_config(policy).items()
+        if key not in (*ELSEWHERE, "type") and before.get(key) != value
+    }
+    facts = json.dumps([policy.type, weights, changes], sort_keys=True, default=str)
+    return f"{policy.type} {hashlib.sha256(facts.encode()).hexdigest()[:12]}"
+
+
+def checkpoint_files(folder: Path) -> dict[str, str]:
+    """Return name -> SHA-256 of the files of a checkpoint."""
+    files = sorted(path for path in folder.iterdir() if path.is_file() and path.name not in NOT_THE_CHECKPOINT)
+    return {path.name: file_hash(path) for path in files}
+
+
+def tree_hash(files: Mapping[str, str]) -> str:
+    """Return one SHA-256 over the lines ``<sha256>  <name>`` in the order of names, as sha256sum prints them."""
+    lines = "".join(f"{files[name]}  {name}\n" for name in sorted(files))
+    return hashlib.sha256(lines.encode()).hexdigest()

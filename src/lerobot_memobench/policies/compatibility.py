@@ -1,8 +1,4 @@
-"""Check that a policy's inputs fit an environment: its observations, and the convention of its images.
-
-A policy runs on images of the convention (`sim.convention`) of its training, or is refused. Each check raises
-`MemobenchError`.
-"""
+"""Check that a policy fits an environment: its observations, and the convention (`sim.convention`) of its images."""
 
 from __future__ import annotations
 
@@ -77,12 +73,8 @@ def check_features(
 ) -> None:
     """Refuse other cameras, or vectors or images of other sizes, than a checkpoint was trained on.
 
-    LeRobot compares only the names of cameras, and only without a ``rename_map``. Policies that pad vectors, and those
-    that read images of any size, would act on inputs unlike their training data.
-
-    Args:
-        shown: features of the environment's observations and action, by LeRobot's names.
-        renamed: LeRobot's ``rename_map``: names of the environment -> names of the policy.
+    LeRobot compares only the names of cameras, and only without a ``rename_map``. ``shown`` are the features of the
+    environment's observations and action; ``renamed`` maps their names to the policy's, as LeRobot's ``rename_map``.
     """
     check_actions(path, policy)
     if getattr(policy, "perception", None) == "any" or not policy.input_features:
@@ -115,8 +107,7 @@ def cameras_read(policy: Any, trained: Mapping[str, Any]) -> list[str]:
     """Return the cameras that a policy needs.
 
     A policy that fills missing images may list cameras of the checkpoint that its training began with; it needs those
-    of its training data, which its statistics name. Without such names, LeRobot's ``policy.empty_cameras`` fills the
-    last ones.
+    of its training data, which its statistics name. LeRobot's ``policy.empty_cameras`` fills the last ones.
     """
     cameras = list(policy.image_features)
     if not hasattr(policy, "empty_cameras"):
@@ -147,10 +138,8 @@ def _list(original: Mapping[str, str]) -> str:
 
 
 def _length(policy: Any, name: str, feature: PolicyFeature, trained: Mapping[str, Any]) -> int | None:
-    """Return the length of a vector in a policy's training data; None if it is unknown.
-
-    A policy that pads vectors may list the padded length, or that of the checkpoint that its training began with.
-    """
+    """Return the length of a vector in a policy's training data; None if it is unknown."""
+    # A policy that pads vectors may list the padded length, or that of the checkpoint that its training began with.
     padded = getattr(policy, "max_state_dim" if name == OBS_STATE else "max_action_dim", None)
     if name in trained and len(trained[name]) == 1:
         return int(trained[name][0])
@@ -181,10 +170,9 @@ def _check_sizes(path: str, policy: PreTrainedConfig, available: Mapping[str, Po
 
 
 def trained_convention(path: str, policy: Any) -> tuple[str | None, str]:
-    """Return the convention of a checkpoint (folder or repository), None if it is unclear, and what shows it.
+    """Return the convention of a checkpoint (folder or repository), None if it is unclear, and the evidence.
 
-    The names of the cameras in its training data decide, then the dataset on this machine, then its repository. They
-    do not depend on the ``rename_map`` of an evaluation.
+    The names of the cameras in its training data decide, then the dataset on this machine, then its repository.
     """
     in_data = {new: old for old, new in trained_names(path).items()}
     cameras = [in_data.get(name, name) for name in cameras_read(policy, statistics_shapes(path))]
@@ -208,9 +196,8 @@ def chosen_convention(
 ) -> str | None:
     """Return the convention of the images for a policy: ``requested``, else that of its training.
 
-    None if the policy reads no images, or has no checkpoint. Another one than the policy's is refused; so is none
-    where the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention: it does not
-    mirror images.
+    None if the policy reads no images, or has no checkpoint. Another one than the policy's is refused; so is none if
+    the policy's is unclear, and a ``rename_map`` that names the wrist camera of another convention.
     """
     if requested is not None:
         check_choice("convention", requested, [*WRIST])

@@ -33,17 +33,11 @@ MEMORY_READS = "memory_reads"
 
 
 class Chunk(TypedDict):
-    """The reads of one action chunk. Steps are control steps, counted from the policy's first observation.
+    """The reads of one action chunk. Steps are control steps, counted from the policy's first observation."""
 
-    Attributes:
-        step: of the plan.
-        entries: steps of the readable frames, ascending; -1, -2, ... for entries without a frame, such as slots.
-        weights: share of attention on each entry; the sum is one if only memory is attended to.
-    """
-
-    step: Count
-    entries: list[Whole]
-    weights: list[Number]
+    step: Count  # of the plan
+    entries: list[Whole]  # steps of the readable frames, ascending; -1, -2, ... for entries without a frame
+    weights: list[Number]  # share of attention on each entry; the sum is one if only memory is attended to
 
 
 class EpisodeReads(TypedDict):
@@ -149,14 +143,10 @@ def find_reads(
             continue
         # The clock of a strict task counts its prompt, even if the policy did not see it.
         shift = int(record.get("prompt_steps") or 0) if unseen and record.get("suite", PUBLISHED) == PUBLISHED else 0
-        chunks: list[Chunk] = [
-            {
-                "step": chunk["step"] + shift,
-                "entries": [entry + shift if entry >= 0 else entry for entry in chunk["entries"]],
-                "weights": chunk["weights"],
-            }
-            for chunk in reads["chunks"]
-        ]
+        chunks = reads["chunks"]
+        for chunk in chunks:
+            chunk["step"] += shift
+            chunk["entries"] = [entry + shift if entry >= 0 else entry for entry in chunk["entries"]]
         if not _fit(reads, chunks, record):
             misfits.append(f"{path} is not of the rollout in the log")
         elif not record.get("paused_steps"):

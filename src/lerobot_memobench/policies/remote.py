@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -48,7 +47,7 @@ BY_DIALECT: Any = None
 MOST_ACTIONS = 4096
 """Largest number of actions in an answer: more than three episodes of the paper's horizon."""
 MOST_THREADS = 256
-"""Largest number of servers that are asked at a time; threads are started as they are needed."""
+"""Largest number of servers that are asked at a time."""
 
 Action = NDArray[np.float32]
 
@@ -121,7 +120,6 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def connection(self) -> type[Connection]:
-        """The kind of connection for the server's dialect."""
         return DIALECTS[self.dialect]
 
     @property
@@ -177,17 +175,14 @@ def _address(text: str) -> str:
 
 
 def make_memobench_remote_pre_post_processors(
-    config: RemoteConfig, dataset_stats: dict[str, dict[str, Any]] | None = None
+    config: RemoteConfig, dataset_stats: dict[str, Any] | None = None
 ) -> tuple[Any, Any]:
     """Return pre- and postprocessor that rename and batch only; images stay on the CPU."""
     return make_processors(replace(config, device="cpu"))
 
 
 class RemotePolicy(UntrainedPolicy):
-    """A policy that asks a server; see `RemoteConfig`. ``select_action`` returns (B, 7) float32.
-
-    Each environment of a batch has a connection and an episode of its own.
-    """
+    """A policy that asks a server; see `RemoteConfig`. Each environment of a batch has a connection of its own."""
 
     config_class = RemoteConfig
     name = "memobench_remote"
@@ -197,6 +192,7 @@ class RemotePolicy(UntrainedPolicy):
         super().__init__(config)
         self.config: RemoteConfig = config
         self._clients: list[Client] = []
+        self._pool = ThreadPoolExecutor(MOST_THREADS, "policy-server")  # threads start as they are needed
         self._cameras = dict(zip(CAMERAS, config.image_features, strict=False))  # LeRobot's, in the environment's order
 
     def reset(self) -> None:
@@ -216,11 +212,7 @@ class RemotePolicy(UntrainedPolicy):
         self._clients.append(Client(self.config, addresses[len(self._clients) % len(addresses)]))
 
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked in parallel.
-
-        Raises:
-            MemobenchError: a server fails, disconnects or gives a wrong answer, or its memory cannot serve the batch.
-        """
+        """Return the next action (B, 7) in [-1, 1] of each environment; servers are asked in parallel."""
         count = len(next(value for value in batch.values() if isinstance(value, Tensor) and value.ndim))
         limit = self.config.max_environments
         if limit is not None and count > limit:
@@ -235,16 +227,11 @@ class RemotePolicy(UntrainedPolicy):
         run = map if count == 1 else self._pool.map
         return torch.from_numpy(np.stack([*run(Client.act, self._clients, observations)]))
 
-    @cached_property
-    def _pool(self) -> ThreadPoolExecutor:
-        return ThreadPoolExecutor(MOST_THREADS, "policy-server")
-
 
 class Client:
     """One environment: its connection, its episode and its queued actions.
 
-    ``phase`` and ``step`` of an observation mark the beginning and the end of an episode (`begins_episode`,
-    `is_frozen`). Without them, an episode begins with the policy's reset.
+    Without ``phase`` and ``step`` in observations, an episode begins with the policy's reset.
     """
 
     def __init__(self, config: RemoteConfig, address: str) -> None:
@@ -395,8 +382,11 @@ class EnvObservation:
         images = [f"{OBS_IMAGES}.{names.get(name, name)}" for names in CONVENTIONS.values()]
         for key in (self.cameras.get(name, ""), *images, OBS_STATE if name == STATE else f"{OBS_STR}.{name}"):
             if key in self.batch:
-                value = self.batch[key][self.env_index]
-                return to_image(value) if OBS_IMAGES in key else value.float().cpu().reshape(-1).numpy()
+                value = self.batch[key][self.env_index].float()
+                if OBS_IMAGES not in key:
+                    return value.cpu().reshape(-1).numpy()
+                pixels = (value * 255).round().clamp(0, 255).to(torch.uint8)
+                return pixels.permute(1, 2, 0).contiguous().cpu().numpy()
         known = [key.removeprefix(f"{OBS_IMAGES}.").removeprefix(f"{OBS_STR}.") for key in self.batch if OBS_STR in key]
         raise MemobenchError(
             f"policy.keys names {name!r}, which the environment does not observe; available: "
@@ -413,13 +403,6 @@ def _flat(batch: Mapping[str, Any]) -> dict[str, Any]:
         for key, value in values.items()
     }
     return {name: value for name, value in batch.items() if name != nested} | parts
-
-
-def to_image(value: Tensor) -> NDArray[np.uint8]:
-    """Convert LeRobot's image (3, H, W) in [0, 1] to the rendered one, (H, W, 3) uint8."""
-    pixels = (value.float() * 255).round().clamp(0, 255).to(torch.uint8)
-    array: NDArray[np.uint8] = pixels.permute(1, 2, 0).contiguous().cpu().numpy()
-    return array
 
 
 def fit(image: NDArray[np.uint8], side: int | None) -> NDArray[np.uint8]:

@@ -50,35 +50,24 @@ class Connection:
     A server first sends its metadata. Then it answers each binary frame with a binary frame, or with a traceback as a
     text frame. An episode that loses its server is not continued, because a server that starts again has lost its
     memory and its random state: the evaluation stops, and resuming it repeats the episode.
-
-    Attributes:
-        port: default port of the server.
-        keys: the server's name of each observation -> our name.
-        image_size: side of sent images, pixels; None: as rendered, and the server resizes them.
-        n_action_steps: default number of executed actions of each answer.
-        prompt_stride: default steps between sent frames of the prompt; None: ``n_action_steps``.
-        buffers: the server receives every frame, in a memory that all of its connections share, so it serves one
-            environment at a time.
-        queues: the server answers one action and queues the rest of its plan.
-
-    Args:
-        address: ``ws://host:port``. timeout: longest time of an answer, s. keys: in place of the dialect's.
     """
 
     # openpi: examples/libero/main.py, src/openpi/serving/websocket_policy_server.py, openpi-client 0.1.2
     protocol: ClassVar[str] = "openpi's websocket protocol"
     port: ClassVar[int] = 8000
-    keys: Mapping[str, str] = {
+    keys: Mapping[str, str] = {  # the server's name of each observation -> our name
         "observation/image": IMAGE,
         "observation/wrist_image": WRIST_IMAGE,
         "observation/state": STATE,
         "prompt": TASK,
     }
-    image_size: ClassVar[int | None] = 224
-    n_action_steps: ClassVar[int] = 5
-    prompt_stride: ClassVar[int | None] = None
+    image_size: ClassVar[int | None] = 224  # side of sent images, pixels; None: as rendered, the server resizes them
+    n_action_steps: ClassVar[int] = 5  # default number of executed actions of each answer
+    prompt_stride: ClassVar[int | None] = None  # default steps between sent frames of the prompt; None: n_action_steps
     buffers: ClassVar[bool] = False
+    """The server receives every frame, in a memory that all of its connections share: one environment at a time."""
     queues: ClassVar[bool] = False
+    """The server answers one action and queues the rest of its plan."""
 
     def __init__(self, address: str, timeout: float, keys: Mapping[str, str] | None = None) -> None:
         self.address, self.timeout, self.keys = address, timeout, keys or self.keys
@@ -135,17 +124,11 @@ class Connection:
             )
             self._connection = self._stack.enter_context(connection)
             return self._greet(patience)
-        except InvalidStatus as error:
-            code = error.response.status_code
-            if code >= 500:  # of a proxy, or of a server that starts
-                raise ServerAway(f"HTTP state {code}") from error
-            raise self._foreign(f"it answered with HTTP state {code}") from error
-        except InvalidHandshake as error:
-            if not isinstance(error, InvalidMessage):
-                raise self._foreign(reason(error)) from error
-            raise ServerAway(reason(error)) from error
         except (OSError, WebSocketException) as error:
-            raise ServerAway(reason(error)) from error
+            away = not isinstance(error, InvalidHandshake) or isinstance(error, InvalidMessage)
+            if isinstance(error, InvalidStatus):
+                away = error.response.status_code >= 500  # of a proxy, or of a server that starts
+            raise (ServerAway(reason(error)) if away else self._foreign(reason(error))) from error
 
     def _greet(self, patience: float) -> dict[str, Any]:
         metadata = self._receive(patience)
@@ -223,18 +206,15 @@ class RoboMMEConnection(Connection):
     port, image_size, prompt_stride, buffers = 8011, None, 1, True
 
     def begin(self, task: str) -> None:
-        """Clear the server's memory."""
         self._frames: list[NamedValues] = []
         self._execution_starts = 0
         self.ask({"reset": True})
 
     def show(self, frame: NamedValues) -> None:
-        """Keep a frame for the next question."""
-        self._frames.append(frame)
+        self.watch(frame)
         self._execution_starts += 1
 
     def watch(self, frame: NamedValues) -> None:
-        """Keep a frame for the next question."""
         self._frames.append(frame)
 
     def plan(self, frame: NamedValues) -> dict[str, Any]:
@@ -252,6 +232,10 @@ class RoboMMEConnection(Connection):
 
 
 # --- openpi's format ---
+
+_VLA_EVALS = "__ndarray__", "data", "dtype", "shape"
+_OPENPIS = b"__ndarray__", b"data", b"dtype", b"shape"
+"""Keys of a packed array."""
 
 
 def pack(message: dict[str, Any]) -> bytes:
@@ -277,17 +261,12 @@ def unpack_message(data: bytes) -> Any:
 
 
 def _unpack(packed: dict[Any, Any]) -> Any:
-    if "__ndarray__" in packed:
-        return _array(packed["data"], packed["dtype"], packed["shape"])
-    if b"__ndarray__" in packed:
-        return _array(packed[b"data"], packed[b"dtype"], packed[b"shape"])
+    for mark, data, dtype, shape in (_OPENPIS, _VLA_EVALS):
+        if mark in packed:
+            return np.frombuffer(packed[data], _dtype(packed[dtype])).reshape(tuple(packed[shape]))
     if b"__npgeneric__" in packed:
         return _dtype(packed[b"dtype"]).type(packed[b"data"])  # of the data's length, whatever length dtype names
     return packed
-
-
-def _array(data: bytes, dtype: Any, shape: Any) -> np.ndarray:
-    return np.frombuffer(data, _dtype(dtype)).reshape(tuple(shape))
 
 
 def _dtype(text: Any) -> np.dtype[Any]:
@@ -316,9 +295,8 @@ ANY_FORMAT = "raw"
 class VlaEvalConnection(Connection):
     """A connection to a model server of vla-evaluation-harness (vla-eval).
 
-    A frame is a map of ``type``, ``payload``, ``seq`` and ``timestamp``. Both sides send ``hello``. The server does not
-    answer an ``episode_start``; it answers an ``observation`` with an ``action`` or an ``error``. The first observation
-    of an episode includes the demonstration prompt.
+    Both sides send ``hello``. The server does not answer an ``episode_start``; it answers an ``observation`` with an
+    ``action`` or an ``error``. The first observation of an episode includes the demonstration prompt.
     """
 
     # vla-eval 0.8: protocol/{messages,numpy_codec,image_codec}.py, connection.py, model_servers/{serve,predict}.py
@@ -335,7 +313,6 @@ class VlaEvalConnection(Connection):
         self.ask({"type": "episode_start", "payload": {"task": {"name": task}}})
 
     def show(self, frame: NamedValues) -> None:
-        """Keep a frame for the next question."""
         self._frames.append({name: _as_png(frame[name]) for name in HISTORY if name in self.keys.values()})
 
     def plan(self, frame: NamedValues) -> dict[str, Any]:
@@ -396,7 +373,6 @@ class VlaEvalConnection(Connection):
         return kind, payload
 
     def close(self) -> None:
-        """Send the end of the episode, and disconnect."""
         if self._in_episode:
             self._in_episode = False
             with suppress(ConnectionClosed, OSError):

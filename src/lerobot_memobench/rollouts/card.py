@@ -1,7 +1,4 @@
-"""The result card of an evaluation, ``evaluation.json``: everything needed to understand, repeat and check it.
-
-`evaluation_file.Card` lists its parts.
-"""
+"""The result card of an evaluation, ``evaluation.json`` (`evaluation_file.Card`): all that is needed to repeat it."""
 
 from __future__ import annotations
 
@@ -14,6 +11,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lerobot_memobench.commands.command_line import without
+from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.evaluation_file import FORMAT, INPUTS, POLICY
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.errors import MemobenchError
@@ -21,20 +20,19 @@ from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.threads import cores, cpu_model
 from lerobot_memobench.policies.checkpoint import (
     ADAPTER_FILE,
+    ELSEWHERE,
     TRAIN_CONFIG,
     WEIGHTS_FILE,
     TrainConfig,
-    local_folder,
-    portable_path,
-)
-from lerobot_memobench.policies.lerobot_config import (
-    ELSEWHERE,
     checkpoint_files,
     encoded_config,
     identity_of,
+    local_folder,
+    portable_path,
     tree_hash,
 )
 from lerobot_memobench.rollouts.plan import EvaluationPlan
+from lerobot_memobench.tasks.catalogue import load_task
 from lerobot_memobench.untrusted import read_json
 
 PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transformers", "numpy", "gymnasium")
@@ -44,9 +42,6 @@ PACKAGES = ("lerobot_policy_memobench", "lerobot", "mujoco", "torch", "transform
 
 def card_of(plan: EvaluationPlan) -> dict[str, Any]:
     """Return the card of an evaluation that is about to begin. Hashes the checkpoint."""
-    from lerobot_memobench.datasets.generate import task_hash
-    from lerobot_memobench.tasks.catalogue import load_task
-
     environment, shard = plan.environment, plan.options.shard
     protocol = {
         "tasks": sorted(task.name for task in plan.grid.tasks),
@@ -61,10 +56,10 @@ def card_of(plan: EvaluationPlan) -> dict[str, Any]:
         POLICY: policy_facts(encoded_config(plan.policy), plan.seed),
         "checkpoint": None,
         "trained_on": None,
-        "task_files": {task.name: task_hash(load_task(task.folder)) for task in plan.grid.tasks},
+        "task_files": {task.name: task_hash(load_task(task)) for task in plan.grid.tasks},
         "settings": plan.settings.portable,
         "shard": None if shard is None else str(shard),
-        "runs": joined_runs([run_facts(plan.command, plan.batch)]),
+        "runs": [{**run_facts(plan.command, plan.batch), "times": 1}],
     }
     return with_checkpoint(card, plan)
 
@@ -97,26 +92,19 @@ def with_checkpoint(card: dict[str, Any], plan: EvaluationPlan) -> dict[str, Any
 
 
 def policy_facts(settings: Mapping[str, Any], seed: int | None) -> dict[str, Any]:
-    """Return the facts that identify a policy apart from its weights.
-
-    They are its configuration as LeRobot encodes it, the seed of the run and, as a detector is not part of a
-    checkpoint, the detector's hash.
-    """
-    recorded = {key: value for key, value in settings.items() if key not in ELSEWHERE and key != "type"}
-    detector = detector_hash(recorded)
-    return {
-        "type": settings.get("type"),
-        "seed": seed,
-        "settings": recorded,
-        **({} if detector is None else {"detector_sha256": detector}),
-    }
+    """Return the facts that identify a policy apart from its weights: its configuration, seed and detector."""
+    recorded = without(settings, *ELSEWHERE, "type")
+    facts = {"type": settings.get("type"), "seed": seed, "settings": recorded}
+    if (detector := detector_hash(recorded)) is not None:  # a checkpoint does not contain the detector
+        facts["detector_sha256"] = detector
+    return facts
 
 
 def detector_hash(settings: Mapping[str, Any]) -> str | None:
     """Return the hash of the detector that a policy reads objects from, None without one; raise if it is missing."""
     if settings.get("detector") is None:
         return None
-    from lerobot_memobench.perception.weights import detector_file
+    from lerobot_memobench.perception.detector import detector_file
 
     return file_hash(detector_file(settings["detector"]))
 
@@ -124,8 +112,8 @@ def detector_hash(settings: Mapping[str, Any]) -> str | None:
 def training_facts(folder: Path) -> dict[str, Any] | None:
     """Return the dataset that a checkpoint was trained on, None where the checkpoint does not name it.
 
-    Where the dataset is on this machine, ``sha256`` is that of its meta files and its manifest, which in turn hold a
-    digest of every episode that `memobench generate` made.
+    ``sha256``, of a dataset on this machine, is that of its meta files and its manifest, which hold a digest of every
+    episode that `memobench generate` made.
     """
     try:
         config = read_json(folder / TRAIN_CONFIG, TrainConfig, "it is ignored")
@@ -172,10 +160,7 @@ def versions() -> dict[str, str]:
 def git_commit() -> str | None:
     """Return the commit of the checkout, with ``+changes`` where files of ``src`` differ; None outside a checkout."""
     package = Path(__file__).resolve().parents[1]
-    if not (package.parents[1] / ".git").exists():
-        return None
-    commit = git(package, "rev-parse", "HEAD")
-    if not commit:
+    if not (package.parents[1] / ".git").exists() or not (commit := git(package, "rev-parse", "HEAD")):
         return None
     return commit + ("+changes" if git(package, "status", "--porcelain", "--", str(package.parent)) else "")
 
@@ -194,12 +179,15 @@ def git(folder: Path, *words: str) -> str | None:
 # --- cards joined ---
 
 
-def extended(card: Mapping[str, Any], other: Mapping[str, Any], *, again: bool = True) -> dict[str, Any]:
+def extended(card: Mapping[str, Any], other: Mapping[str, Any], folder: Path, *, again: bool = True) -> dict[str, Any]:
     """Return a card for two runs of one evaluation, with the extent, runs and task hashes of both.
 
-    Args:
-        again: whether an equal run is another start, or the same start read twice.
+    Other task files than those of ``folder``, of one of the runs, are refused. ``again``: whether an equal run is
+    another start, or the same start read twice.
     """
+    for name, value in card["task_files"].items():
+        if other["task_files"].get(name, value) != value:
+            raise MemobenchError(f"the episodes of {name} in {folder} were run with other task files")
     a, b = card["protocol"], other["protocol"]
     extent = {"tasks": sorted({*a["tasks"], *b["tasks"]}), "episodes": max(a["episodes"], b["episodes"])}
     settings = card["settings"]

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from lerobot_memobench.envs.evaluation_file import (
     require_whole,
     write_evaluation,
 )
-from lerobot_memobench.envs.lerobot import Opener
 from lerobot_memobench.envs.settings import SWAP
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.records import Run
@@ -34,11 +33,10 @@ from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import refuse_links, remove_drafts
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.jobs.threads import limit_torch
-from lerobot_memobench.policies.checkpoint import check_weights, portable_path
-from lerobot_memobench.policies.lerobot_config import quiet
+from lerobot_memobench.policies.checkpoint import check_weights, portable_path, quiet
 from lerobot_memobench.policies.memory_reads import MEMORY_READS, noting_reads
 from lerobot_memobench.rollouts.card import card_of, extended, with_checkpoint
-from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, PlannedTask, Shard
+from lerobot_memobench.rollouts.plan import Cell, EvaluationPlan, Shard
 from lerobot_memobench.rollouts.rollout import Actor, BatchSeeds, roll
 
 VIDEOS = "videos"
@@ -46,21 +44,16 @@ VIDEOS = "videos"
 Note = Callable[[str], None]
 """Called with a message for the user; the run continues."""
 
-Advance = Callable[[int, int, str], None]
+BatchCallback = Callable[[int, int, str], None]
 """Called after each batch with the finished episodes, all episodes of the run, and the task's name."""
 
 
-def run_evaluation(
-    plan: EvaluationPlan, note: Note, begin: Note = lambda text: None, advance: Advance = lambda *news: None
-) -> Run | None:
+def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: BatchCallback) -> Run | None:
     """Run the missing episodes, write report and card; return None for a part that holds no episode.
 
     Args:
         note: called with notes, and with the command that resumes a run that breaks off.
         begin: called with a line on the evaluation before it starts.
-
-    Raises:
-        MemobenchError: the folder holds another evaluation, or weights are missing. Any error of LeRobot.
     """
     if plan.policy_path is not None:
         check_weights(plan.policy_path, plan.policy)
@@ -73,51 +66,34 @@ def run_evaluation(
             check_new(plan.log)
         for part in sorted(plan.output.parent.glob(Shard.FOLDERS)) if plan.options.shard is not None else ():
             resumed_card(part, card, lambda text: None)  # else the parts could not be merged
-        cells = missing(plan)
-        if cells:
-            begin(_summary(plan))
-            return _run(plan, card, cells, note, advance)
-        if not has_log(plan.log):
+        # A batch with a missing episode is run whole; its logged rows rest.
+        if cells := plan.grid.missing(logged(plan.log), plan.options.shard):
+            policy = portable_path(plan.policy_path) if plan.policy_path else plan.policy.type
+            tasks = count_of(len(plan.grid.tasks), "task") + (" with variants" if plan.environment.evidence else "")
+            episodes = count_of(plan.grid.runs, "episode")
+            begin(f"evaluating {policy} on {tasks}, {episodes} each, into {plan.output}")
+            write_evaluation(plan.log, card)
+            try:
+                evaluate(plan, cells, card, advance)
+            except BaseException:  # Ctrl-C too
+                if has_log(plan.log):
+                    note(
+                        f"the episodes that ended are in {plan.log}; report them: `memobench report {plan.log}`; "
+                        f"resume: `{plan.resuming_command}`"
+                    )
+                raise
+        elif has_log(plan.log):
+            write_evaluation(plan.log, card)
+        else:
             return None
-        write_evaluation(plan.log, card)
         return write_report(plan.log)
-
-
-def _summary(plan: EvaluationPlan) -> str:
-    policy = portable_path(plan.policy_path) if plan.policy_path else plan.policy.type
-    tasks = count_of(len(plan.grid.tasks), "task") + (" with variants" if plan.environment.evidence else "")
-    return f"evaluating {policy} on {tasks}, {count_of(plan.grid.runs, 'episode')} each, into {plan.output}"
-
-
-def _run(plan: EvaluationPlan, card: dict[str, Any], cells: Sequence[Cell], note: Note, advance: Advance) -> Run:
-    ended = False
-
-    def begin() -> None:
-        write_evaluation(plan.log, with_checkpoint(card, plan))
-
-    write_evaluation(plan.log, card)
-    try:
-        evaluate(plan, cells, begin, advance)
-        ended = True
-        return write_report(plan.log)
-    finally:
-        if not ended and has_log(plan.log):
-            note(
-                f"the episodes that ended are in {plan.log}; report them: `memobench report {plan.log}`; "
-                f"resume: `{plan.resuming_command}`"
-            )
 
 
 # --- the loop ---
 
 
-def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], None], advance: Advance) -> None:
-    """Run batches of episodes; the environments write the log.
-
-    Args:
-        cells: the batches, those of one task in succession.
-        begin: called once, after the policy is loaded and before the first scene; writes the evaluation's file.
-    """
+def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], card: dict[str, Any], advance: BatchCallback) -> None:
+    """Run batches of episodes, those of one task in succession; the environments write the log."""
     policy: Any = plan.policy
     device = get_safe_torch_device(policy.device)
     # As LeRobot's own command sets them, before it makes the policy.
@@ -126,56 +102,32 @@ def evaluate(plan: EvaluationPlan, cells: Sequence[Cell], begin: Callable[[], No
     set_seed(plan.seed)
     actor = load_actor(plan)
     limit_torch(sum(parameter.numel() for parameter in actor.policy.parameters()))
-    begin()
+    card = with_checkpoint(card, plan)  # which the hub has delivered by now
+    write_evaluation(plan.log, card)
     # Logged rows of a resumed batch rest, and have no memory to swap.
     rests = plan.environment.corrupt != SWAP
     environment = replace(plan.environment, resume=rests and has_log(plan.log))
-    facts = read_evaluation(plan.log)
-    by = Acting(facts[POLICY], facts["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
+    by = Acting(card[POLICY], card["protocol"][INPUTS], range(plan.seed, plan.seed + plan.grid.runs))
     # The loaded policy's configuration: some policies of LeRobot replace their plan by that of the checkpoint.
-    opened = environment.opener(actor.policy.config, by, plan.log)
-    environments = Environments(opened, plan.settings.use_async_envs is not False)
+    open_environments = environment.opener(actor.policy.config, by, plan.log)
     seeds = BatchSeeds(actor.policy, plan.seed)
-    scenes = environment.settings
-    reads = partial(noting_reads, plan.log, scenes) if plan.options.memory_reads else None
+    scenes, reads = environment.settings, plan.options.memory_reads
     amp = torch.autocast(device_type=device.type) if policy.use_amp else nullcontext()
     done, total = 0, sum(len(plan.grid.runs_of(number)) for _, number in cells)
-    with amp, closing(environments):
-        for task, number in cells:
-            runs = plan.grid.runs_of(number)
-            batch = range(plan.seed + runs.start, plan.seed + runs.stop)
-            env = environments.of(task, len(batch))
-            seeds.begin(task.name, batch.start)
-            with nullcontext() if reads is None else reads(task.name, actor.policy, batch) as ended:
-                roll(env, actor, batch, ended, scenes.corrupt)
-            done += len(batch)
-            advance(done, total, task.name)
-
-
-class Environments:
-    """The vector environment of one task and batch size at a time.
-
-    Args:
-        opened: makes one. use_async: gives each row a process of its own.
-    """
-
-    def __init__(self, opened: Opener, use_async: bool) -> None:
-        self._opened, self._use_async = opened, use_async
-        self._key: tuple[PlannedTask, int] | None = None
-        self._env: Any = None
-
-    def of(self, task: PlannedTask, rows: int) -> Any:
-        """Return the environment of a task with a number of rows, after closing any other."""
-        if self._key != (task, rows):
-            self.close()
-            self._env, self._key = self._opened(task.folder, rows, self._use_async), (task, rows)
-        return self._env
-
-    def close(self) -> None:
-        """Close the environment that is open."""
-        if self._env is not None:
-            self._env.close()
-        self._env = self._key = None
+    groups = itertools.groupby(cells, lambda cell: (cell[0], len(plan.grid.runs_of(cell[1]))))
+    for (task, rows), group in groups:
+        # Without settings of the user, each environment has a process of its own.
+        opened = open_environments(task, rows, plan.settings.use_async_envs is not False)
+        with amp, closing(opened) as env:
+            for _, number in group:
+                runs = plan.grid.runs_of(number)
+                batch = range(plan.seed + runs.start, plan.seed + runs.stop)
+                seeds.begin(task.name, batch.start)
+                watched = noting_reads(plan.log, scenes, task.name, actor.policy, batch) if reads else nullcontext()
+                with watched as ended:
+                    roll(env, actor, batch, ended, scenes.corrupt)
+                done += len(batch)
+                advance(done, total, task.name)
 
 
 def load_actor(plan: EvaluationPlan) -> Actor:
@@ -201,12 +153,10 @@ def load_actor(plan: EvaluationPlan) -> Actor:
 
 
 def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, Any]:
-    """Return the card for an evaluation that resumes the one in ``folder``.
+    """Return the card for an evaluation that resumes the one in ``folder``, if there is one.
 
-    Tasks and episodes may differ: finished ones are kept. Without an evaluation in the folder the card is returned.
-
-    Raises:
-        MemobenchError: it is another evaluation: of another protocol, policy, or of other task files.
+    Tasks and episodes may differ: finished ones are kept. Another protocol, another policy and other task files are
+    refused.
     """
     check_folder(folder)
     if not has_log(folder):
@@ -222,29 +172,12 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
             note(f"note: {folder} names no policy: whether its episodes are of this policy cannot be checked")
         return card
     require_whole(folder, earlier)
-    edited = [name for name, value in card["task_files"].items() if earlier["task_files"].get(name, value) != value]
-    if edited:
-        raise MemobenchError(f"the files of {edited[0]} differ from those that the episodes in {folder} were run with")
-    for changed in _run_differences(earlier["runs"][-1], card["runs"][-1]):
-        note(f"note: numbers may depend on a change since the episodes in {folder}: {changed}")
-    return extended(earlier, card)
-
-
-def _run_differences(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the differences of two starts on which numbers may depend: the batch size, and the first version."""
-    sizes = {"batch_size": earlier["batch_size"]}, {"batch_size": now["batch_size"]}
-    differences = []
-    for old, new in (sizes, (earlier["versions"], now["versions"])):
-        changed = [f"{key} {old[key]}, now {new[key]}" for key in new if old.get(key, new[key]) != new[key]]
-        differences += changed[:1]
-    return differences
-
-
-def missing(plan: EvaluationPlan) -> list[Cell]:
-    """Return the batches that are to be run; a batch with a missing episode is run whole, its logged rows rest."""
-    options = plan.options
-    done = logged(plan.log) if options.resume or options.shard is not None else set()
-    return plan.grid.missing(done, options.shard)
+    both = extended(earlier, card, folder)
+    old, new = ({"batch_size": run["batch_size"], **run["versions"]} for run in (earlier["runs"][-1], card["runs"][-1]))
+    changed = [f"{key} {old[key]}, now {new[key]}" for key in new if old.get(key, new[key]) != new[key]]
+    for change in changed[: 1 + (old["batch_size"] != new["batch_size"])]:  # and the first version that differs
+        note(f"note: numbers may depend on a change since the episodes in {folder}: {change}")
+    return both
 
 
 def logged(folder: Path) -> set[Key]:
@@ -273,9 +206,6 @@ def locked_evaluation(plan: EvaluationPlan) -> Iterator[None]:
     """Make and lock the folders of an evaluation and of its log, see `locked_folder`.
 
     Drafts of a killed run are removed. A run that ends before its first episode leaves no evaluation file.
-
-    Raises:
-        MemobenchError: another run writes there, or the folder of videos or memory reads is a link.
     """
     with ExitStack() as stack:
         for folder in {folder.absolute(): folder for folder in (plan.output, plan.log)}.values():

@@ -1,9 +1,8 @@
 """Repeat the evaluation that a card describes and compare every episode.
 
-A card is data that anybody may have written. Its settings decide which packages are imported and which files are read.
-So only known settings of the environment, the policy and the evaluation are accepted. None of them may name code, a
-folder to write to or another machine; files to read are those of this machine. Numbers have limits, and the card must
-hold the outcome of every episode.
+A card is data that anybody may have written, and its settings decide which packages are imported and which files are
+read. So only known settings are accepted. None of them may name code, a folder to write to or another machine; files to
+read are those of this machine. Numbers have limits, and the log must hold the outcome of every episode.
 """
 
 from __future__ import annotations
@@ -36,11 +35,18 @@ from lerobot_memobench.envs.pacing import longest
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.records import SCENES, disagreements, other_hashes
-from lerobot_memobench.policies.checkpoint import local_folder
-from lerobot_memobench.policies.lerobot_config import checkpoint_files, has_device, tree_hash
+from lerobot_memobench.policies.checkpoint import checkpoint_files, has_device, local_folder, tree_hash
 from lerobot_memobench.rollouts.card import PACKAGES, detector_hash, versions
-from lerobot_memobench.rollouts.plan import EvaluationPlan, RunOptions, Shard, make_plan
-from lerobot_memobench.rollouts.settings import ENVIRONMENT, OWN, EvaluationSettings, card_settings
+from lerobot_memobench.rollouts.plan import (
+    ENVIRONMENT,
+    OWN,
+    EvaluationPlan,
+    EvaluationSettings,
+    RunOptions,
+    Shard,
+    card_settings,
+    make_plan,
+)
 from lerobot_memobench.untrusted import Malformed, checked, parsed
 
 MOST_STEPS = 400 * HORIZON
@@ -52,7 +58,8 @@ REACHING_OUT = ("push_to_hub", "private", "use_peft", "trust_remote_code", "disc
 SERVERS = ("host", "servers")
 WORD = re.compile(r"[\w.,+' ()-]*")  # no slash, which paths and names of repositories have
 DEVICE = re.compile(r"cpu|mps|(cuda|xpu)(:\d{1,3})?")
-SERVER = re.compile(r"(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?")
+_SERVER = r"\s*(?:\w+://)?(?:127\.0\.0\.1|localhost)(?::\d+)?\s*"
+HERE = re.compile(f"{_SERVER}(?:,{_SERVER})*")
 OBSERVATION = re.compile(r"[\w./-]+")
 
 
@@ -66,13 +73,12 @@ def repeat(
     """Repeat the evaluation of a card and compare every episode; return 1 where one ended differently.
 
     Args:
-        path, server: see `read_repeatable`.
-        out: folder of the repetition, a dated one when None.
+        path, server: see `read_repeatable`. out: folder of the repetition, a dated one when None.
         evaluate: runs the plan and returns its exit status.
         say: called with differences of this machine, and with the result.
     """
     card, settings = read_repeatable(path, server)
-    check_policy(card, settings.policy_path)
+    check_policy(card, settings.policy.get("path"))
     for note in differences_here(card):
         say(f"note: {note}")
     plan = plan_of_evaluation(card, settings, out)
@@ -98,11 +104,9 @@ def repeat(
 
 
 def read_repeatable(path: Path, server: str | None = None) -> tuple[dict[str, Any], EvaluationSettings]:
-    """Return the card of an evaluation and its settings, checked by `allowed_settings`.
+    """Return the card in a file or a folder, and its settings, checked by `allowed_settings`.
 
-    Args:
-        path: the card's file or its folder.
-        server: address of the policy's server (``host:port``, or several with commas); the card's when None.
+    ``server``: address of the policy's server (``host:port``, or several with commas); the card's when None.
     """
     card = read_evaluation(path, whole=True)
     return card, allowed_settings(card_settings(card), server)
@@ -122,12 +126,7 @@ def plan_of_evaluation(
 
 
 def check_extent(card: Mapping[str, Any], episodes: Sequence[Mapping[str, Any]], plan: EvaluationPlan) -> None:
-    """Refuse a card whose settings run other episodes than it names, or whose episodes may take too long.
-
-    Raises:
-        MemobenchError: success, steps or checkpoints of an episode of its protocol are not in the log, an episode of
-            another protocol is, or an episode may take more than `MOST_STEPS`.
-    """
+    """Refuse a card whose settings run other episodes than it names and logs, or whose episodes may take too long."""
     protocol, grid = card["protocol"], plan.grid
     tasks = sorted(task.name for task in grid.tasks)
     if (tasks, grid.runs) != (sorted(protocol["tasks"]), protocol["episodes"]):
@@ -156,15 +155,12 @@ def check_policy(card: Mapping[str, Any], path: str | None) -> None:
     if path is None:
         return
     policy = card["policy"]
-    pairs = (
-        (f"checkpoint {path}", tree_hash(checkpoint_files(Path(path))), policy.get("sha256")),
-        (
-            f"detector {policy.get('settings', {}).get('detector')}",
-            detector_hash(policy.get("settings", {})),
-            policy.get("detector_sha256"),
-        ),
-    )
-    for name, here, stored in pairs:
+    settings = policy.get("settings", {})
+    hashes = {
+        f"checkpoint {path}": (tree_hash(checkpoint_files(Path(path))), policy.get("sha256")),
+        f"detector {settings.get('detector')}": (detector_hash(settings), policy.get("detector_sha256")),
+    }
+    for name, (here, stored) in hashes.items():
         if here != stored:
             raise MemobenchError(
                 f"the {name} is not the one on the card (sha256 {str(here)[:12]} here, {str(stored)[:12]} on the "
@@ -174,28 +170,20 @@ def check_policy(card: Mapping[str, Any], path: str | None) -> None:
 
 def differences_here(card: Mapping[str, Any]) -> list[str]:
     """Return the differences between this machine and those of a card's runs."""
-    here = versions()
-    notes = []
+    here, notes = versions(), dict[str, None]()  # without repetitions
     for run in card["runs"]:
-        changed = [
-            f"{name} {version} (here {here[name]})"
-            for name, version in run["versions"].items()
-            if here.get(name, version) != version
-        ]
+        used = run["versions"].items()
+        changed = [f"{name} {there} (here {here[name]})" for name, there in used if here.get(name, there) != there]
         if changed:
-            notes.append(f"the card's run used {', '.join(changed)}; results may depend on it")
-    return list(dict.fromkeys(notes))
+            notes[f"the card's run used {', '.join(changed)}; results may depend on it"] = None
+    return [*notes]
 
 
 # --- settings that a card may hold ---
 
 
 def allowed_settings(settings: EvaluationSettings, server: str | None = None) -> EvaluationSettings:
-    """Return a card's settings, checked, with the policy's checkpoint by its folder.
-
-    Args:
-        server: address of the policy's server, in place of the card's.
-    """
+    """Return a card's settings, checked, with the policy's checkpoint by its folder, and its server if one is given."""
     if not all(OBSERVATION.fullmatch(name) for pair in settings.rename_map.items() for name in pair):
         raise _refused("rename_map", settings.rename_map, "expected names of observations")
     for name, value in settings.env.items():
@@ -212,10 +200,7 @@ def allowed_settings(settings: EvaluationSettings, server: str | None = None) ->
 
 
 def _allowed_policy(policy: dict[str, Any], server: str | None) -> dict[str, Any]:
-    """Return the settings of a card's policy, checked; its checkpoint is a folder of this machine.
-
-    Of a repository, it is the copy in the hub's cache, without a download.
-    """
+    """Return the settings of a card's policy, checked; its checkpoint is a folder here, without a download."""
     for name in ("path", "type"):
         if not isinstance(value := policy.get(name), str | None):
             raise _refused(f"policy.{name}", value, "expected a name")
@@ -264,17 +249,11 @@ def _checked(known: Mapping[str, Any], name: str, value: Any) -> Any:
         raise _refused(key, value, "it may name a file or a repository")
     if not (kind in PLAIN or is_enum(kind) or is_literal(kind)):
         try:
-            checked(
-                parsed(value) if isinstance(value, str) else value,
-                bool | float | list[bool | float | list[bool | float]],
-            )
+            numbers = parsed(value) if isinstance(value, str) else value
+            checked(numbers, bool | float | list[bool | float | list[bool | float]])
         except Malformed:
             raise _refused(key, value, "expected numbers") from None
     return value_of(key, known[name], value)
-
-
-def _are_here(text: str) -> bool:
-    return all(SERVER.fullmatch(part.strip()) for part in text.split(","))
 
 
 def _is_device_here(text: str) -> bool:
@@ -284,16 +263,11 @@ def _is_device_here(text: str) -> bool:
     return match is not None and int((match[2] or ":0")[1:]) < max(1, torch.cuda.device_count())
 
 
+WORDS = ("size", "perception", "align", "subgoal_level", "memory_fusion", "memory_camera", "detector", "dtype")
 TEXTS: dict[str, tuple[Callable[[str], Any], str]] = {
-    **dict.fromkeys(
-        (
-            *("size", "perception", "align", "subgoal_level", "memory_fusion", "memory_camera", "detector"),
-            *("dtype", "dialect", "gripper"),
-        ),
-        (WORD.fullmatch, "words"),
-    ),
+    **dict.fromkeys((*WORDS, "dialect", "gripper"), (WORD.fullmatch, "words")),
     **dict.fromkeys(("label", "keys"), (str.isprintable, "a line of text")),
-    **dict.fromkeys(SERVERS, (_are_here, "this machine (127.0.0.1); name a server that you trust by --server")),
+    **dict.fromkeys(SERVERS, (HERE.fullmatch, "this machine (127.0.0.1); name a server that you trust by --server")),
     "device": (_is_device_here, "cpu, mps, cuda or cuda:<number of a GPU that is here>"),
 }
 """Text setting of a policy -> the check of its value, and the expected values."""

@@ -18,6 +18,7 @@ import torch
 from lerobot.envs import check_env_attributes_and_types, preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION, OBS_IMAGES
+from lerobot.utils.random_utils import set_seed
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import CLOCK
@@ -45,8 +46,8 @@ class ActionQueue:
 
     A plan of LeRobot's policies in `CHUNKED` is queued here, so that no observation is needed until the queue is empty;
     any other policy selects each action by itself. It may define ``needs_observation``: whether, after an action, it
-    reads the next images or objects; and ``has_planned_action``: whether its next ``select_action`` reads only
-    ``observation.phase`` and ``observation.step``.
+    reads the next images or objects; and ``has_planned_action``: whether its next ``select_action`` reads the clock
+    alone.
     """
 
     def __init__(self, policy: Any) -> None:
@@ -96,11 +97,9 @@ def plans_chunks(policy: Any) -> bool:
 
 
 class Actor:
-    """A policy of LeRobot's interface between its processors.
+    """A policy of LeRobot's interface between processors of observations and of actions.
 
-    Args:
-        before: processors of observations: the environment's, then the policy's.
-        after: processors of actions: the policy's, then the environment's.
+    The environment's are first for observations (``before``), the policy's for actions (``after``).
     """
 
     def __init__(
@@ -127,8 +126,7 @@ def roll(env: Any, actor: Actor, seeds: Sequence[int], ended: Ended | None = Non
     """Run one episode in each row; the environments write the log.
 
     Args:
-        env: vector environment of `MemobenchEnvConfig`.
-        seeds: one per row.
+        env: vector environment of `MemobenchEnvConfig`. seeds: one per row.
         corrupt: what happens to the memory of rows when their environments report so, see `EnvSettings`.
     """
     actor.actions.reset()
@@ -211,8 +209,6 @@ class BatchSeeds:
 
     def begin(self, task: str, first: int) -> None:
         """Seed for the batch of a task whose first episode has the seed ``first``."""
-        from lerobot.utils.random_utils import set_seed
-
         if getattr(self._policy, "name", None) in KEEPS_ITS_NOISE:
             return
         set_seed(batch_seed(self._seed, task, first))

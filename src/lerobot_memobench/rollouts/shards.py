@@ -6,14 +6,12 @@ finished part is skipped.
 
 from __future__ import annotations
 
-import functools
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +28,13 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run, disagreement
 from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.io import draft_of, refuse_links
-from lerobot_memobench.jobs.processes import ProgressCallback
-from lerobot_memobench.jobs.running import run_jobs
+from lerobot_memobench.jobs.processes import ProgressCallback, run_jobs
 from lerobot_memobench.jobs.threads import sharing
 from lerobot_memobench.policies.memory_reads import MEMORY_READS
 from lerobot_memobench.rollouts.card import card_of, extended
 from lerobot_memobench.rollouts.evaluate import (
     VIDEOS,
     Note,
-    check_folder,
     check_new,
     locked_folder,
     logged,
@@ -54,23 +50,15 @@ LOGS = "logs"
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One part of an evaluation, as a job.
+    """One part of an evaluation, as a job."""
 
-    Attributes:
-        program: arguments of Python that start ``lerobot`` in a process which ends when its standard input does.
-        words: the command line of the evaluation after ``lerobot eval``, without folders and run options.
-        out: folder of the evaluation.
-        directory: where relative paths are looked up.
-        at_once: parts that run at the same time.
-    """
-
-    program: tuple[str, ...]
-    words: tuple[str, ...]
+    program: tuple[str, ...]  # arguments of Python for a process of ``lerobot`` that ends when its standard input does
+    arguments: tuple[str, ...]  # the command line of the part, after ``lerobot``
     shard: Shard
-    out: Path
+    out: Path  # folder of the evaluation
     episodes: frozenset[Key]
-    directory: Path
-    at_once: int
+    directory: Path  # where relative paths are looked up
+    at_once: int  # parts that run at the same time
 
     @property
     def folder(self) -> Path:
@@ -88,11 +76,6 @@ class ShardJob:
         return self.shard.number
 
     @property
-    def arguments(self) -> list[str]:
-        """The command line of the part, after ``lerobot``."""
-        return ["eval", *self.words, f"output_dir={self.out}", f"shard={self.shard}", "resume=true"]
-
-    @property
     def messages(self) -> Path:
         """File for the output of the part's process."""
         return self.out / LOGS / f"{self.shard.folder}.log"
@@ -106,11 +89,7 @@ class ShardJob:
         return None
 
     def run(self) -> None:
-        """Run the part in a process of its own, which ends when this process does.
-
-        Raises:
-            MemobenchError: it failed, with its error message.
-        """
+        """Run the part in a process of its own, which ends when this process does; raise with its error message."""
         self.messages.parent.mkdir(parents=True, exist_ok=True)
         with self.messages.open("ab") as file:
             process = subprocess.Popen(
@@ -139,8 +118,7 @@ class ShardJob:
 def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> list[ShardJob]:
     """Return a job for each part of an evaluation, which starts ``program``.
 
-    Raises:
-        MemobenchError: there are more parts than batches, or the folders hold another evaluation.
+    More parts than batches, and folders that hold another evaluation are refused.
     """
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
     if options.shards > (batches := len(grid.cells())):
@@ -150,7 +128,7 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     jobs = [
         ShardJob(
             program=tuple(program),
-            words=tuple(words),
+            arguments=("eval", *words, f"output_dir={out}", f"shard={shard}", "resume=true"),
             shard=shard,
             out=out,
             episodes=frozenset(episode for cell in grid.cells(shard) for episode in grid.episodes(cell)),
@@ -159,7 +137,6 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
         )
         for shard in (Shard(k + 1, options.shards) for k in range(options.shards))
     ]
-    check_folder(out)
     if options.resume:
         card = card_of(plan)
         for folder in (out, *(job.folder for job in jobs)):
@@ -195,31 +172,23 @@ def merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
 def _merge_and_report(out: Path, folders: Sequence[Path]) -> Run:
     merge(out, folders)
     run = write_report(out)
-    if run.protocol[POLICY]:
-        return run
-    note = f"{out} does not name the policy of its episodes: no part did"
-    return replace(run, notes=[*run.notes, note])
+    notes = [] if run.protocol[POLICY] else [f"{out} does not name the policy of its episodes: no part did"]
+    return replace(run, notes=[*run.notes, *notes])
 
 
 def merge(out: Path, folders: Sequence[Path]) -> None:
     """Merge the logs, cards and videos of evaluations of one protocol into the folder ``out``.
 
     Episodes of ``out`` are kept. Videos and memory reads are hard links where the disk allows it, else copies;
-    LeRobot's own files are not merged. All checks are made before the first file is written.
-
-    Raises:
-        MemobenchError: there are no parts, protocols or policies differ, a line contradicts them, a part does not name
-            its policy where another does, or an episode ended differently in two parts.
+    LeRobot's own files are not merged. Before the first file is written, all differences between the parts are refused.
     """
-    sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     if not folders:
         raise MemobenchError(f"{out} holds no parts ({Shard.FOLDERS}); name the folders to merge")
+    sources = list(dict.fromkeys([*([out] if has_log(out) else []), *folders]))
     lines = {source: read_lines(source) for source in sources}
     cards = {source: read_evaluation(source) for source in sources}
-    logs = {source: joined(source, cards[source], lines[source]) for source in sources}
     card = _joined_card(cards)
-    records = join(logs)
-
+    records = join({source: joined(source, cards[source], lines[source]) for source in sources})
     refuse_links(out / VIDEOS, out / MEMORY_READS)
     for source in folders:
         if source != out:
@@ -260,14 +229,9 @@ def _joined_card(cards: Mapping[Path, dict[str, Any]]) -> dict[str, Any]:
         return {"format": card["format"], "protocol": protocol, POLICY: card[POLICY]}
     for folder, part_card in cards.items():
         require_whole(folder, part_card)
-    whole = functools.reduce(partial(extended, again=False), cards.values())
-    for folder, part_card in cards.items():
-        for name, value in part_card["task_files"].items():
-            if whole["task_files"][name] != value:
-                raise MemobenchError(
-                    f"the episodes of {name} in {folder} were run with other task files than the others"
-                )
-    return whole
+    for folder, other in rest:
+        card = extended(card, other, folder, again=False)
+    return card
 
 
 def _share(source: Path, target: Path, pattern: str) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import nan, pi
 from typing import Literal
 
@@ -22,66 +22,44 @@ from lerobot_memobench.sim.robot import BASE_POSITION
 from lerobot_memobench.tasks.task import Task
 
 TABLE = "kitchen_table"
-TABLE_SIZE = (1.0, 1.2, 0.05)
-"""Size of the table's board, m."""
-TABLE_TOP = 0.90
-"""Height of the table's top, m; its centre is at x = y = 0."""
-COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4
-"""Groups of geoms with contacts, of drawn geoms, and of sites."""
+TABLE_SIZE = (1.0, 1.2, 0.05)  # size of the table's board, m
+TABLE_TOP = 0.90  # height of the table's top, m; its centre is at x = y = 0
+COLLISION_GROUP, VISUAL_GROUP, SITE_GROUP = 0, 1, 4  # groups of geoms with contacts, of drawn geoms, and of sites
 
-ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)
-"""Yaws of a grasp whose fingers close along x or y of the body [rad]."""
+ALONG_X, ALONG_Y = 0.0, float(np.pi / 2)  # yaws of a grasp whose fingers close along x or y of the body [rad]
 Triple = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-"""wxyz."""
+Quaternion = tuple[float, float, float, float]  # wxyz
 
 
 @dataclass(frozen=True)
 class Grasp:
-    """A top-down grasp: gripper pointing down, its closing axis level.
+    """A top-down grasp: gripper pointing down, its closing axis level."""
 
-    ``position``: centre between the finger tips in the body's frame [m].
-    ``yaw``: angle of the closing axis about the body's z [rad]; 0 closes along the body's x.
-    ``width``: width of the grasped part [m].
-    ``symmetric``: whether position and axis may be rotated together about the body's z axis by any angle.
-    """
-
-    position: Triple
-    yaw: float
-    width: float
-    symmetric: bool = False
+    position: Triple  # centre between the finger tips in the body's frame, m
+    yaw: float  # angle of the closing axis about the body's z, rad; 0 closes along the body's x
+    width: float  # of the grasped part, m
+    symmetric: bool = False  # whether position and axis may be rotated together about the body's z by any angle
 
 
 @dataclass(frozen=True, kw_only=True)
 class Articulation:
-    """A drawer, door or knob of a fixture, with its handle and the thresholds of its predicates.
-
-    Drawers and doors are open for q < ``open_below`` and closed for q > ``closed_above``; knobs are on for
-    q >= ``on_at_least`` and off for q < ``off_below``; inapplicable thresholds are nan.
-
-    ``joint``: its name, for an instance with the instance's name. ``body``: name of the moving body in its class.
-    ``handle``: centre of the handle in that body's frame, m. ``handle_quaternion``: rotation from the handle's frame (x
-    along it, y into the fixture) to the body's. ``handle_size``: extents along x, y and z, m. ``clearance``: free
-    space behind the handle, m. ``closed_q`` and ``open_q``: targets of q (off and on for a knob), m or rad.
-    ``ranges``: `init` predicate -> range of initial q. ``shares_origin``: whether the moving body has the fixture's
-    origin, so that only the handle distinguishes it from other parts.
-    """
+    """A drawer, door or knob of a fixture, with its handle and the thresholds of its predicates, m or rad."""
 
     kind: Literal["drawer", "door", "knob"]
-    joint: str
-    body: str
-    handle: Triple
-    handle_size: Triple
-    clearance: float
-    handle_quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    closed_q: float
-    open_q: float
-    ranges: Mapping[str, tuple[float, float]]
-    open_below: float = nan
-    closed_above: float = nan
-    on_at_least: float = nan
-    off_below: float = nan
-    shares_origin: bool = False
+    joint: str  # its name; of an instance, with the instance's name
+    body: str  # name of the moving body in its class
+    handle: Triple  # centre of the handle in that body's frame
+    handle_size: Triple  # extents along x, y and z
+    clearance: float  # free space behind the handle
+    handle_quaternion: Quaternion = (1.0, 0.0, 0.0, 0.0)  # from the handle's frame (x along it, y in) to the body's
+    closed_q: float  # target of q, off for a knob
+    open_q: float  # target of q, on for a knob
+    ranges: Mapping[str, tuple[float, float]]  # `init` predicate -> range of initial q
+    open_below: float = nan  # drawers and doors are open for q below, nan for a knob
+    closed_above: float = nan  # and closed for q above
+    on_at_least: float = nan  # knobs are on for q from here, nan for drawers and doors
+    off_below: float = nan  # and off for q below
+    shares_origin: bool = False  # whether the moving body has the fixture's origin, and only the handle is distinct
 
     @property
     def handle_site(self) -> str:
@@ -91,32 +69,20 @@ class Articulation:
 
 @dataclass(frozen=True)
 class Asset:
-    """Metadata of one instance.
-
-    ``low`` and ``high``: corners of the bounding box in the body's frame [m], joints at their closed pose.
-    ``regions``: region name (``top_region``, ``cook_region``, ...) -> full name of its box site.
-    ``articulations``: region name, or ``""`` for the whole fixture -> joint.
-    ``supports``: height of the supporting surface in the body's frame: a bowl's floor, else the top [m];
-    ``clear_radius``: radius of that surface [m].
-    ``glow``: full names of visual geoms that glow while the fixture is on.
-    ``round``: whether the outline from above is a circle about the origin.
-    ``upright``: rotation from the asset's frame to the body's if another body axis than z points up; all values are in
-    the asset's frame.
-    """
+    """Metadata of one instance; all values are in the asset's frame."""
 
     name: str
     class_name: str
     kind: Literal["object", "fixture"]
-    low: Triple
+    low: Triple  # corner of the bounding box, m, joints at their closed pose
     high: Triple
-    grasps: tuple[Grasp, ...] = ()
-    articulations: Mapping[str, Articulation] = field(default_factory=dict)
-    regions: Mapping[str, str] = field(default_factory=dict)
-    supports: float = 0.0
-    clear_radius: float = 0.0
-    glow: tuple[str, ...] = ()
-    round: bool = False
-    upright: Quaternion | None = None
+    grasps: tuple[Grasp, ...]
+    articulations: Mapping[str, Articulation]  # region name, or "" for the whole fixture -> joint
+    regions: Mapping[str, str]  # region name (``top_region``, ``cook_region``, ...) -> full name of its box site
+    supports: float  # height of the supporting surface: a bowl's floor, else the top, m
+    clear_radius: float  # radius of that surface, m
+    round: bool  # whether the outline from above is a circle about the origin
+    upright: Quaternion | None  # rotation to the body's frame, if another body axis than z points up
 
     @property
     def bottom(self) -> float:
@@ -149,56 +115,39 @@ def split_class(class_name: str) -> tuple[str, int]:
 
 # --- LIBERO's classes ---
 
-Turn = tuple[str, float, float]
-"""Axis (x, y or z), and the range of the angle, rad."""
+Turn = tuple[str, float, float]  # axis (x, y or z), and the range of the angle, rad
 UPRIGHT: Turn = ("x", 0.0, 0.0)
 QUARTER: Turn = ("x", pi / 2, pi / 2)
 BOTTLE: tuple[Turn, ...] = (QUARTER, ("z", pi / 2, pi / 2))
 SCANNED, GROCERY, MODELLED = "stable_scanned_objects", "stable_hope_objects", "turbosquid_objects"
-FIXTURE = "articulated_objects"
-"""Folders of MJCF files below the assets folder."""
+FIXTURE = "articulated_objects"  # folders of MJCF files below the assets folder
 
 
 @dataclass(frozen=True)
 class LiberoClass:
-    """Class of an object or fixture.
+    """Class of an object or fixture."""
 
-    Attributes:
-        folder: folder of its MJCF file.
-        turns: initial rotations, applied in order; fixtures are rotated as stated by the task.
-        parts: pairs of region and part; the region is "" if atoms use the fixture's name.
-        grasps: top-down grasps; by default at the sides of the bounding box.
-        floor, clear: height and radius of a container's floor, m; nan for objects that support others on their top.
-        round: whether the outline from above is a circle about the origin.
-        y_up: whether the object's y axis points up; grasps are in the frame with z up (`scene.Y_UP`).
-    """
-
-    folder: str
-    turns: tuple[Turn, ...] = (QUARTER,)
-    parts: tuple[tuple[str, Articulation], ...] = ()
-    grasps: tuple[Grasp, ...] = ()
-    floor: float = nan
-    clear: float = nan
-    round: bool = False
-    y_up: bool = False
+    folder: str  # of its MJCF file
+    turns: tuple[Turn, ...] = (QUARTER,)  # initial rotations, applied in order; a task states those of fixtures
+    parts: tuple[tuple[str, Articulation], ...] = ()  # region and part; "" if atoms use the fixture's name
+    grasps: tuple[Grasp, ...] = ()  # from the top; by default at the sides of the bounding box
+    floor: float = nan  # height of a container's floor, m; nan for objects that support others on their top
+    clear: float = nan  # radius of that floor, m
+    round: bool = False  # whether the outline from above is a circle about the origin
+    y_up: bool = False  # whether the object's y axis points up; grasps are in the frame with z up (`scene.Y_UP`)
 
     def mjcf(self, class_name: str) -> str:
         """Return the path of the class's file below the assets folder."""
-        return (
-            f"{self.folder}/{class_name}.xml"
-            if self.folder == FIXTURE
-            else f"{self.folder}/{class_name}/{class_name}.xml"
-        )
+        folder = self.folder if self.folder == FIXTURE else f"{self.folder}/{class_name}"
+        return f"{folder}/{class_name}.xml"
 
 
 def _bowl(radius: float, height: float, width: float, *, floor: float, clear: float) -> LiberoClass:
-    """Return a class whose rim of this radius, height and width is grasped."""
     rim = Grasp((radius, 0.0, height), ALONG_X, width, symmetric=True)
     return LiberoClass(SCANNED, grasps=(rim,), floor=floor, clear=clear, round=True)
 
 
-_DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}
-"""Drawer -> height of its handle, m."""
+_DRAWERS = {"top": 0.18393, "middle": 0.11041, "bottom": 0.04114}  # drawer -> height of its handle, m
 
 
 def _drawer(level: str, height: float) -> Articulation:
@@ -300,51 +249,34 @@ SUITE_CLASSES: dict[str, LiberoClass] = {
 }
 """Classes of LIBERO's own suites only, which object observations do not contain."""
 ALL_CLASSES = CLASSES | SUITE_CLASSES
-UNKNOWN_CLASS = LiberoClass("")
-"""A scan or a user's class; only its bounding box is known."""
+UNKNOWN_CLASS = LiberoClass("")  # a scan or a user's class; only its bounding box is known
 
 
 # --- arenas ---
 
 AGENTVIEW_POSITION = (0.6586131746834771, 0.0, 1.6103500240372423)
 AGENTVIEW_QUATERNION = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
-AGENTVIEW_ANGLE = 45.0
-"""Vertical field of view of the agentview camera, degrees."""
+AGENTVIEW_ANGLE = 45.0  # vertical field of view of the agentview camera, degrees
 LOW_VIEW = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
 """Quaternion wxyz of the agentview camera in the arenas without a mount."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arena:
-    """A room with a table.
+    """A room with a table. Positions in m, quaternions wxyz."""
 
-    Attributes:
-        file: path of its MJCF file below the assets folder.
-        floor, wall: textures, below the folder ``textures``.
-        body: body of the table, which carries the sites of its regions.
-        zones: origin of the regions of these sites in that body's frame, m.
-        origin: origin of the regions from which placements are drawn, m.
-        fixture_drop: height of a placed fixture's origin above ``origin``, m.
-        inset: whether an object's whole outline is drawn inside its region.
-        lays_out: whether LIBERO's code sets the sizes of the table, those of the kitchen.
-        friction: friction of that table; by default that of the file.
-        base: position of the arm's base, m.
-        mounted: whether the arm stands on its mount.
-        camera_position, camera_quaternion: pose of the agentview camera, m and wxyz.
-    """
-
-    file: str
-    floor: str = "light-gray-floor-tile.png"
+    file: str  # MJCF, below the assets folder
+    floor: str = "light-gray-floor-tile.png"  # texture, below the folder ``textures``
     wall: str = "light-gray-plaster.png"
-    body: str
-    zones: Triple
-    origin: Triple
-    fixture_drop: float = 0.01 - TABLE_SIZE[2]
-    inset: bool = False
-    lays_out: bool = False
-    friction: Triple | None = None
-    base: Triple = BASE_POSITION
-    mounted: bool = True
+    body: str  # of the table, which carries the sites of its regions
+    zones: Triple  # origin of the regions of these sites in that body's frame
+    origin: Triple  # origin of the regions from which placements are drawn
+    fixture_drop: float = 0.01 - TABLE_SIZE[2]  # height of a placed fixture's origin above ``origin``
+    inset: bool = False  # whether an object's whole outline is drawn inside its region
+    lays_out: bool = False  # whether LIBERO's code sets the sizes of the table, those of the kitchen
+    friction: Triple | None = None  # of that table; by default that of the file
+    base: Triple = BASE_POSITION  # of the arm
+    mounted: bool = True  # whether the arm stands on its mount
     camera_position: Triple = AGENTVIEW_POSITION
     camera_quaternion: Quaternion = AGENTVIEW_QUATERNION
 

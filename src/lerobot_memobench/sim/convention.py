@@ -16,8 +16,7 @@ UPRIGHT, MIRRORED = "upright", "libero"
 WRIST = {UPRIGHT: "wrist_image", MIRRORED: "image2"}
 CONVENTIONS = {convention: {"image": "image", "wrist_image": wrist} for convention, wrist in WRIST.items()}
 """Convention -> camera -> name of its image."""
-STATED = "trained_convention"
-"""Key by which a policy server states the convention of its policy's training."""
+STATED = "trained_convention"  # key by which a policy server states the convention of its policy's training
 OTHER = {UPRIGHT: MIRRORED, MIRRORED: UPRIGHT}
 LIBERO_CAMERAS = {"image": "agentview_image", "wrist_image": "robot0_eye_in_hand_image"}
 """Camera -> its name in LIBERO, which LeRobot's ``camera_name_mapping`` maps to the name of its image."""

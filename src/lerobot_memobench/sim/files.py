@@ -11,10 +11,10 @@ import contextlib
 import hashlib
 import importlib.util
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 from huggingface_hub import constants
@@ -26,10 +26,8 @@ from lerobot_memobench.sim.asset import split_class
 ASSETS_VARIABLE = "MEMOBENCH_LIBERO_ASSETS"
 """Environment variable with the folder that contains `stable_scanned_objects`, `scenes` and the other asset folders, or
 with a LIBERO checkout."""
-SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"
-"""Environment variable with the authors' folder `new_objects`."""
-OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"
-"""Environment variable with the user's folder of objects, `<class>/<class>.xml`."""
+SCANS_VARIABLE = "MEMOBENCH_NEW_OBJECTS"  # environment variable with the authors' folder `new_objects`
+OBJECTS_VARIABLE = "MEMOBENCH_OBJECTS"  # environment variable with the user's folder of objects, `<class>/<class>.xml`
 OWN_OBJECTS = Path(__file__).with_name("objects")
 """Folder of this package's objects of the scanned classes, in LIBERO's layout."""
 REPOSITORY = "lerobot/libero-assets"
@@ -57,58 +55,45 @@ def known_hashes() -> dict[str, str]:
     return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
-@dataclass(frozen=True)
-class AssetsFolder:
-    """A folder with LIBERO's assets, how it was found, and why it is not used; "" if all files have their hashes."""
+class AssetsFolder(NamedTuple):
+    """A folder with LIBERO's assets, and how it was found."""
 
     source: str
     folder: Path
-    fault: str = ""
 
 
-def places() -> list[AssetsFolder]:
-    """Return the folders with LIBERO's assets in the order of use, to the first one without a fault."""
-    folders = []
+def find_assets() -> tuple[AssetsFolder | None, str]:
+    """Return the first place with all files, None without one, and a message's part on the incomplete places before."""
+    unused = ""
     for source, folder in _candidates():
         try:
             _verified(folder)
         except MemobenchError as error:
-            folders.append(AssetsFolder(source, folder, str(error)))
+            unused += f"; not used: {source}, {error}"
         else:
-            return [*folders, AssetsFolder(source, folder)]
-    return folders
+            return AssetsFolder(source, folder), unused
+    return None, unused
 
 
-def check_assets() -> Path:
-    """Return the folder of LIBERO's assets, with every file verified.
+def located() -> AssetsFolder:
+    """Return the place of LIBERO's assets, with every file verified.
 
     Raises:
         MemobenchError: no place has all files; the message lists incomplete places and how to obtain the files.
     """
+    place, unused = find_assets()
+    if place is None:
+        raise MemobenchError(f"LIBERO's assets, which every scene needs, are not on this machine{unused}; {OBTAIN}")
+    return place
+
+
+def check_assets() -> Path:
+    """Return the folder of LIBERO's assets; errors as of `located`."""
     return located().folder
 
 
-def located() -> AssetsFolder:
-    """Return the place of LIBERO's assets that is used; errors as of `check_assets`."""
-    if (folder := usable(folders := places())) is not None:
-        return folder
-    raise MemobenchError(
-        f"LIBERO's assets, which every scene needs, are not on this machine{unused(folders)}; {OBTAIN}"
-    )
-
-
-def usable(found: Sequence[AssetsFolder]) -> AssetsFolder | None:
-    """Return the one of the `places` that is used, None if all have a fault."""
-    return found[-1] if found and not found[-1].fault else None
-
-
-def unused(found: Iterable[AssetsFolder]) -> str:
-    """Return the part of a message that names places with a fault."""
-    return "".join(f"; not used: {folder.source}, {folder.fault}" for folder in found if folder.fault)
-
-
 def asset(name: str) -> Path:
-    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `check_assets`."""
+    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `located`."""
     return _verified(check_assets())[name]
 
 
@@ -134,14 +119,7 @@ def _candidates() -> Iterator[tuple[str, Path]]:
 
 @cache
 def _verified(folder: Path) -> dict[str, Path]:
-    """Return name -> path of all LIBERO files of a folder, after comparing their hashes.
-
-    Hashing takes 0.1 to 0.4 s. A stamp in the folder of caches has a name that depends on inode, size and times of all
-    files; while it exists, the files are those of an earlier comparison.
-
-    Raises:
-        MemobenchError: naming the first file that is missing or has another content.
-    """
+    """Return name -> path of all LIBERO files of a folder; raise `MemobenchError` for a missing or changed one."""
     paths, versions = {name: folder / name for name in known_hashes()}, [*known_hashes().items()]
     try:
         for path in paths.values():
@@ -151,6 +129,7 @@ def _verified(folder: Path) -> dict[str, Path]:
             # Programs can set the time of modification, but not the time of the last change.
             times = state.st_mtime_ns, state.st_ctime_ns
             versions.append((str(path), repr((state.st_dev, state.st_ino, state.st_size, *times))))
+        # Hashing takes 0.1 to 0.4 s. While a stamp for inode, size and times of all files exists, they are unchanged.
         stamp = cache_folder() / "libero" / f"{hashlib.sha256(repr(versions).encode()).hexdigest()}.verified"
         if not stamp.exists():
             for name, path in paths.items():
@@ -165,11 +144,7 @@ def _verified(folder: Path) -> dict[str, Path]:
 
 
 def user_objects(built_in: Collection[str]) -> dict[str, Path]:
-    """Return class -> MJCF file, existing or not, of each folder in the user's folder of objects.
-
-    Raises:
-        MemobenchError: the user's folder does not exist, or contains a class in ``built_in``.
-    """
+    """Return class -> MJCF file, existing or not, of each folder in the user's folder; raise for ``built_in`` names."""
     setting = user_folders()[-1]
     if not setting:
         return {}
@@ -186,9 +161,6 @@ def scan(class_name: str) -> Path | None:
     """Return the MJCF file of a scan; None if the user has set no folder of scans, or it lacks an unknown class.
 
     The scans of a category are sorted by name: ``<category>`` is the first one, ``<category>__k`` the one with index k.
-
-    Raises:
-        MemobenchError: the folder or the scan does not exist.
     """
     setting = os.environ.get(SCANS_VARIABLE)
     if not setting:
@@ -226,10 +198,10 @@ def obtain() -> AssetsFolder:
     import httpx
     from huggingface_hub import snapshot_download
 
-    folders = places()
-    if (folder := usable(folders)) is not None:
-        return folder
-    wanted, damaged = [*known_hashes()], any(folder.source == HUB_CACHE for folder in folders)
+    place, unused = find_assets()
+    if place is not None:
+        return place
+    wanted, damaged = [*known_hashes()], HUB_CACHE in unused
     try:
         snapshot_download(REPOSITORY, repo_type="dataset", allow_patterns=wanted, force_download=damaged)
     except (OSError, httpx.TransportError) as error:
@@ -243,10 +215,7 @@ def obtain() -> AssetsFolder:
 def copy_to(folder: Path) -> int:
     """Copy the files that scenes read, and their terms, into a folder; return their size, bytes.
 
-    Files with the right content stay, so the same call continues an interrupted one.
-
-    Raises:
-        MemobenchError: the folder has another file of a name, or no place has all files.
+    Files with the right content stay, so the same call continues an interrupted one; another file is an error.
     """
     source, size = check_assets(), 0
     for name, known in known_hashes().items():

@@ -25,8 +25,7 @@ from lerobot_memobench.tasks.task import STRICT
 from lerobot_memobench.untrusted import refusing
 
 SCAN_TURNS: tuple[Turn, ...] = (QUARTER,)
-REFERENCES = ("mesh", "material", "texture")
-"""Attributes that reference an asset."""
+REFERENCES = ("mesh", "material", "texture")  # attributes that reference an asset
 USER_TAGS = ("mujoco", "asset", "mesh", "texture", "material", "worldbody", "body", "geom", "site")
 """Elements of a user's object file."""
 SIZE_SITES = ("bottom_site", "top_site", "horizontal_radius_site")
@@ -35,24 +34,15 @@ GUIDE = "docs/develop/add_an_object_class.md"
 
 @dataclass(frozen=True)
 class ClassFile:
-    """Content of a class's files. Do not modify its elements.
+    """Content of a class's files. Do not modify its elements."""
 
-    Attributes:
-        body: root body with default classes resolved.
-        assets: returns meshes, textures and materials with absolute file paths.
-        radius: horizontal radius that must be free of other objects, m.
-        bottom, top: heights of underside and top above the origin, m.
-        turns: initial rotations, applied in order.
-        stand_in: whether this package's object replaces a missing scan.
-    """
-
-    body: ET.Element
-    assets: Callable[[], list[ET.Element]]
-    radius: float
-    bottom: float
+    body: ET.Element  # root body with default classes resolved
+    assets: Callable[[], list[ET.Element]]  # returns meshes, textures and materials with absolute file paths
+    radius: float  # horizontal radius that must be free of other objects, m
+    bottom: float  # height of the underside above the origin, m
     top: float
-    turns: tuple[Turn, ...]
-    stand_in: bool = False
+    turns: tuple[Turn, ...]  # initial rotations, applied in order
+    stand_in: bool = False  # whether this package's object replaces a missing scan
 
     @property
     def collides_by_mesh(self) -> bool:
@@ -66,13 +56,7 @@ def is_visual(element: ET.Element) -> bool:
 
 
 def class_file(class_name: str, suite: str) -> ClassFile:
-    """Return the content of a class's files: LIBERO's, this package's, the user's or a scan's.
-
-    Published tasks use the authors' scan if the user has it; strict tasks use this package's objects for all users.
-
-    Raises:
-        MemobenchError: the class is unknown, or its files are missing or have unexpected content.
-    """
+    """Return the content of a class's files: LIBERO's, this package's, the user's or a scan's."""
     own = own_objects()
     user_classes = files.user_objects({*ARENAS, *ALL_CLASSES, *own})
     if class_name in ALL_CLASSES:
@@ -81,6 +65,7 @@ def class_file(class_name: str, suite: str) -> ClassFile:
         return _object_class(files.asset(mjcf), known.turns, posixpath.dirname(mjcf))
     if file_name(class_name, "the class of an object") in user_classes:
         return _user_class(user_classes[class_name])
+    # Published tasks use the authors' scan if the user has it; strict tasks are equal for all users.
     scan = files.scan(class_name) if suite != STRICT else None
     if scan is not None:
         return _scanned_class(scan)
@@ -157,8 +142,6 @@ def _object_class(path: Path, turns: tuple[Turn, ...], folder: str | None = None
 
 
 def _inside(path: Path) -> Callable[[str], Path]:
-    """Return a function that finds the files that ``path`` references in its folder."""
-
     def inside(name: str) -> Path:
         file = (path.parent / name).resolve()
         if not file.is_relative_to(path.parent.resolve()) or not file.is_file():
@@ -214,7 +197,6 @@ def format_numbers(values: Iterable[float]) -> str:
 
 
 def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
-    """Return a copy of a body with the file's default classes resolved."""
     defaults = {
         (default.get("class", ""), element.tag): element.attrib
         for default in root.iter("default")

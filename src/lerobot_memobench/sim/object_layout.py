@@ -5,8 +5,7 @@ from __future__ import annotations
 import itertools
 from typing import Any
 
-SLOTS = 16
-"""Number of slots. The catalogue's largest scene needs ten."""
+SLOTS = 16  # number of slots. The catalogue's largest scene needs ten.
 
 FIELDS = {"present": 1, "class": 1, "position": 3, "rotation": 6, "joint": 1, "highlighted": 1}
 """Field -> size, in the order of a slot.
@@ -28,8 +27,7 @@ BOUNDS = {
 """Field -> lower and upper bound of its values. Visible objects are within the room, which is 5 m wide."""
 
 WIDTH = sum(FIELDS.values())
-SIZE = SLOTS * WIDTH
-"""Length of the observation."""
+SIZE = SLOTS * WIDTH  # length of the observation
 
 NAMES = [
     f"object_{slot}.{name}" + (f"_{k}" if size > 1 else "")

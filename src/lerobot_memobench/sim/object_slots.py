@@ -29,8 +29,7 @@ from lerobot_memobench.sim.placement import quaternion_matrix
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, Simulation
 from mujoco_raster.highlights import Highlight
 
-POINTS_PER_THING = 24
-"""Ray targets per thing."""
+POINTS_PER_THING = 24  # ray targets per thing
 POSE_RESOLUTION = 1e-4
 """Resolution of poses, m and rad. A drawer with content rests a nanometre from an empty one; without rounding the
 difference would reveal the content or change the order of slots."""
@@ -62,26 +61,17 @@ _NORMALS_ARGUMENT = (None,) if "normal:" in str(mujoco.mj_multiRay.__doc__) else
 class Thing:
     """An object, a fixture, or a moving part of a fixture."""
 
-    kind: int
-    """Index of its class."""
-    body: int
-    """Id of the body that defines its pose."""
-    joint: int | None
-    """Address of its joint in qpos, None without one."""
-    site: int | None
-    """Id of the site that defines its position, None for the body's."""
-    ordered_by: int
-    """Id of the body whose position sorts it."""
+    kind: int  # index of its class
+    body: int  # id of the body that defines its pose
+    joint: int | None  # address of its joint in qpos, None without one
+    site: int | None  # id of the site that defines its position, None for the body's
+    ordered_by: int  # id of the body whose position sorts it
 
 
 class ObjectSlots:
     """Compute object observations of one simulation.
 
-    Attributes:
-        things: all things of the scene: each object and fixture, followed by its moving parts.
-
-    Raises:
-        MemobenchError: the scene has more things than there are slots, or an unregistered class.
+    ``things``: all things of the scene: each object and fixture, followed by its moving parts.
     """
 
     def __init__(self, sim: Simulation) -> None:
@@ -212,7 +202,6 @@ def fill_slots(things: Array, places: Array | None = None) -> NDArray[np.float32
 
 
 def _geom_points(model: mujoco.MjModel, geom: int) -> Array:
-    """Return points (n, 3) on a geom's surface in its frame: a mesh's vertices, else its bounding box's corners."""
     if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
         mesh = model.geom_dataid[geom]
         first = model.mesh_vertadr[mesh]
@@ -233,6 +222,5 @@ def _farthest(points: Array, count: int) -> Array:
 
 
 def _in_image(rays: Array, fovy: float) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the rays (n, 3) in a camera's frame (looking along -z) that hit its square image."""
     edge = -rays[:, 2] * np.tan(np.radians(fovy) / 2)
     return (np.abs(rays[:, 0]) < edge) & (np.abs(rays[:, 1]) < edge)

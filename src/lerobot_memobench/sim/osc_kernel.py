@@ -14,8 +14,7 @@ import numpy as np
 
 from mujoco_raster.compiled import compiled
 
-KP, NULLSPACE_KP = 150.0, 10.0
-"""Gains of the published, critically damped controller."""
+KP, NULLSPACE_KP = 150.0, 10.0  # gains of the published, critically damped controller
 KD, NULLSPACE_KD = float(2 * np.sqrt(KP)), float(2 * np.sqrt(NULLSPACE_KP))
 
 exact = partial(compiled, fastmath=False)
@@ -115,19 +114,12 @@ def write_controls(  # type: ignore[no-untyped-def]
     qpos, qvel, bias, jacobian, mass, position, rotation, goal, goal_rotation, home,
     limits, arm_ctrl, finger_range, finger_ctrl, gripper, change, gravity_only,
 ):  # fmt: skip
-    """Write the controls of one physics step.
+    """Write the controls of one physics step to ``arm_ctrl`` (7,) and ``finger_ctrl`` (2,).
 
-    Args:
-        qpos, qvel, bias: positions, velocities and bias forces of the arm (7,).
-        jacobian, mass: Jacobian of the grip site (6, 7) and mass matrix (7, 7).
-        position, rotation, goal, goal_rotation: present and desired pose of the grip site, (3,) and (3, 3).
-        home: joint angles of the posture (7,).
-        limits: smallest and largest torques (2, 7).
-        arm_ctrl, finger_ctrl: outputs (7,) and (2,).
-        gripper: finger commands (2,), updated in place.
-        change: change of the finger commands (2,).
-        finger_range: smallest and largest finger targets (2, 2), m.
-        gravity_only: whether the torques only hold the arm against gravity.
+    ``qpos``, ``qvel``, ``bias``, ``home`` (7,): of the arm; the last is the angles of its posture. ``jacobian`` (6, 7),
+    ``position``, ``rotation``, ``goal``, ``goal_rotation``: of the grip site. ``mass`` (7, 7). ``limits`` (2, 7) of the
+    torques and ``finger_range`` (2, 2) of the targets: smallest, largest. ``gripper`` (2,): finger commands, updated in
+    place by ``change`` (2,). ``gravity_only``: whether the torques only hold the arm against gravity.
     """
     torques = bias.copy()
     if not gravity_only:

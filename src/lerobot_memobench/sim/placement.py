@@ -12,7 +12,7 @@ Episode k of the paper's evaluation has seed 7 + k. All draws of a scene come fr
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -24,54 +24,36 @@ from lerobot_memobench.sim.mjcf import ClassFile, class_file
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import Task
 
-MAX_DRAWS = 5000
-"""Maximum number of draws of a position."""
-MODEL_LOADS = 2
-"""Number of times LIBERO loads the model until the end of the first reset."""
-OBJECT_DROP_HEIGHT = 0.01
-"""Initial height of an object above the table or another object, m."""
+MAX_DRAWS = 5000  # maximum number of draws of a position
+MODEL_LOADS = 2  # number of times LIBERO loads the model until the end of the first reset
+OBJECT_DROP_HEIGHT = 0.01  # initial height of an object above the table or another object, m
 
 Array = NDArray[np.float64]
-Rectangle = tuple[float, float, float, float]
-"""x1, y1, x2, y2, m."""
+Rectangle = tuple[float, float, float, float]  # x1, y1, x2, y2, m
 CENTRE_ONLY: Rectangle = (0.0, 0.0, 0.0, 0.0)
-Pose = NDArray[np.float64]
-"""Position and quaternion wxyz, (7,)."""
-
-
-def _placing_atoms(task: Task, assets: Iterable[str]) -> list[Atom]:
-    """Return the placing `init` atom of each instance, in the order of `init`."""
-    placing = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
-    missing = [name for name in assets if name not in placing]
-    if missing:
-        raise MemobenchError(
-            f"task {task.name} has no start for {missing[0]!r}; add (On {missing[0]} <region>) to its :init"
-        )
-    return list(placing.values())
+Pose = NDArray[np.float64]  # position and quaternion wxyz, (7,)
 
 
 class Placer:
-    """Place fixtures and objects of one simulation by the `init` atoms of its task.
-
-    Raises:
-        MemobenchError: an instance has no placing atom.
-    """
+    """Place fixtures and objects of one simulation by the `init` atoms of its task."""
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
         self._arena = arena_of(task)
-        self._places = _placing_atoms(task, assets)
+        self._placing = {atom.args[0]: atom for atom in task.init if atom.predicate in ("on", "in")}
+        for name in assets:
+            if name not in self._placing:
+                advice = f"add (On {name} <region>) to its :init"
+                raise MemobenchError(f"task {task.name} has no start for {name!r}; {advice}")
         self._files = {name: class_file(asset.class_name, task.suite) for name, asset in assets.items()}
 
     def place(self, seed: int, draw: int = 0) -> None:
         """Sample a placement of a seed and write it into model (fixtures) and data (objects, joints).
 
-        Of the scenes of a seed, only ``draw`` 0 is LIBERO's.
-
         Raises:
             MemobenchError: a region has no free space for its object.
         """
-        # The first one is the stream of LIBERO's own `np.random.seed`.
+        # Draw 0 is LIBERO's, the stream of its own `np.random.seed`.
         rng = np.random.RandomState([seed, draw] if draw else seed)
         rng.randn(7)
         joints = self._draw_joints(rng)
@@ -79,12 +61,11 @@ class Placer:
         still = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         self._write({name: still for name, asset in self._assets.items() if asset.kind == "fixture"}, joints)
         poses: dict[str, Pose] = {}
-        for atom in self._in_order():
+        for atom in sorted(self._placing.values(), key=self._rank):
             poses[atom.args[0]] = self._draw(atom, poses, rng)
         self._write(poses, joints)
 
     def _write(self, poses: Mapping[str, Pose], joints: Mapping[str, float]) -> None:
-        """Write poses of fixtures and objects, and positions of joints; keep velocities."""
         model, data = self._model, self._data
         for name, pose in poses.items():
             if self._assets[name].kind == "fixture":
@@ -98,17 +79,13 @@ class Placer:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
 
-    def _in_order(self) -> list[Atom]:
-        """Return the placing atoms in LIBERO's order: on the table, on fixtures, in regions, on objects."""
-
-        def rank(atom: Atom) -> int:
-            if atom.args[1] in self._assets:
-                return 3
-            if atom.predicate == "in":
-                return 2
-            return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
-
-        return sorted(self._places, key=rank)
+    def _rank(self, atom: Atom) -> int:
+        """Return LIBERO's order of placing: on the table, on fixtures, in regions, on objects."""
+        if atom.args[1] in self._assets:
+            return 3
+        if atom.predicate == "in":
+            return 2
+        return 1 if self._task.regions[atom.args[1]].target in self._assets else 0
 
     # --- joints ---
 
@@ -138,12 +115,10 @@ class Placer:
     # --- places ---
 
     def _draw(self, atom: Atom, poses: Mapping[str, Pose], rng: np.random.RandomState) -> Pose:
-        """Draw a free position and then the rotation for a placing atom.
-
-        LIBERO ignores overlaps of fixtures and of objects on objects.
-        """
+        """Draw a free position and then the rotation for a placing atom."""
         name, where = atom.args
         rectangles, base = self._room(atom, poses)
+        # LIBERO ignores overlaps of fixtures and of objects on objects.
         alone = self._assets[name].kind == "fixture" or where in self._assets
         obstacles = {} if alone else poses
         known, z = self._files[name], base[2] - self._files[name].bottom
@@ -151,18 +126,17 @@ class Placer:
             x1, y1, x2, y2 = rectangles[rng.randint(len(rectangles))]
             position = rng.uniform(x1, x2) + base[0], rng.uniform(y1, y2) + base[1], z
             if all(_is_clear_of(known, position, self._files[obstacle], obstacles[obstacle]) for obstacle in obstacles):
-                return np.array([*position, *self._turn(name, where, rng)])
+                if self._assets[name].kind == "fixture":
+                    low, high = sorted(self._task.regions[where].yaw)
+                    return np.array([*position, *_quaternion("z", rng.uniform(low, high))])
+                return np.array([*position, *sample_orientation(known.turns, rng)])
         raise MemobenchError(
             f"task {self._task.name}: {name} overlapped with another object in each of {MAX_DRAWS} draws of its "
             "position; move the regions of its :init apart"
         )
 
     def _room(self, atom: Atom, poses: Mapping[str, Pose]) -> tuple[Sequence[Rectangle], Array]:
-        """Return the ranges of x and y, and their origin (3,) with the height of the underside.
-
-        On a fixture's region the range is half the region, reduced by the object's radius, by which some arenas reduce
-        all ranges. In regions and on objects the position is the centre.
-        """
+        """Return the ranges of x and y, and their origin (3,) with the height of the underside."""
         name, where = atom.args
         if where in self._assets:
             if where not in poses:
@@ -182,18 +156,12 @@ class Placer:
         base = owner[:3] + _single_precision_matrix(owner[3:]) @ self._data.site_xpos[site]
         if atom.predicate == "in":
             return [CENTRE_ONLY], base
+        # As in LIBERO, half the region, reduced by the object's radius.
         x, y = self._model.site_size[site][:2] / 2 - self._files[name].radius
         return [(-x, -y, x, y)], base + np.array([0.0, 0.0, self._files[region.target].top])
 
-    def _turn(self, name: str, where: str, rng: np.random.RandomState) -> Array:
-        if self._assets[name].kind == "fixture":
-            low, high = sorted(self._task.regions[where].yaw)
-            return _quaternion("z", rng.uniform(low, high))
-        return sample_orientation(self._files[name].turns, rng)
-
 
 def _is_clear_of(thing: ClassFile, position: tuple[float, float, float], other: ClassFile, pose: Pose) -> bool:
-    """Return whether an object's disc is clear of another's, or far enough above it."""
     distance = np.hypot(position[0] - pose[0], position[1] - pose[1])
     return bool(distance > other.radius + thing.radius or position[2] - pose[2] > other.top - thing.bottom)
 
@@ -208,15 +176,13 @@ def _quaternion(axis: str, angle: float) -> Array:
 
 
 def sample_orientation(turns: tuple[Turn, ...], rng: np.random.RandomState) -> Array:
-    """Draw an object's quaternion (4,) as LIBERO.
-
-    LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
-    about z. Several rotations are multiplied in single precision.
-    """
+    """Draw an object's quaternion (4,) as LIBERO."""
+    # LIBERO's sampler writes (x, y, z, w), but its reader expects (w, x, y, z): a rotation of 90° about x becomes one
+    # about z.
     drawn = [np.roll(_quaternion(axis, rng.uniform(low, high)), -1) for axis, low, high in turns]
     if len(drawn) == 1:
         return drawn[0]
-    q = np.array([0.0, 0.0, 0.0, 1.0])
+    q = np.array([0.0, 0.0, 0.0, 1.0])  # several rotations are multiplied in single precision
     for x1, y1, z1, w1 in drawn:
         x0, y0, z0, w0 = q
         q = np.array(

@@ -18,14 +18,12 @@ from lerobot_memobench.constants import CONTROL_HZ
 
 Array = NDArray[np.float64]
 
-FOLDER = Path(__file__).with_name("panda")
-"""Folder of the arm's MJCF and meshes."""
+FOLDER = Path(__file__).with_name("panda")  # folder of the arm's MJCF and meshes
 BASE_POSITION = (-0.66, 0.0, 0.0)
 """Base of the mount, m: x = −0.16 − table length / 2 (robosuite's offset for a table of 1 m)."""
 ARM_START = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.22675220, np.pi / 4)
 """Joint angles at reset, rad (LIBERO's mounted Panda)."""
-GRIPPER_START = (0.020833, -0.020833)
-"""Finger positions at reset, m."""
+GRIPPER_START = (0.020833, -0.020833)  # finger positions at reset, m
 GRIPPER_OPEN = (0.04, -0.04)
 """Finger positions of the open hand, m. Opening fingers approach them for seconds; strict episodes start there, so that
 the finger positions do not reveal the time since they were closed."""
@@ -39,18 +37,14 @@ WRIST_CAMERA = "robot0_eye_in_hand"
 
 PHYSICS_STEP = 0.002
 SUBSTEPS = round(1 / (CONTROL_HZ * PHYSICS_STEP))
-POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5
-"""Metres and radians per unit of action."""
-CLOSING_SIGNS = np.array([-1.0, 1.0])
-"""Signs of the finger commands that close the gripper."""
-GRIPPER_SPEED = 0.01
-"""Change of the gripper command (−1 open … 1 closed) per physics step."""
+POSITION_SCALE, ROTATION_SCALE = 0.05, 0.5  # metres and radians per unit of action
+CLOSING_SIGNS = np.array([-1.0, 1.0])  # signs of the finger commands that close the gripper
+GRIPPER_SPEED = 0.01  # change of the gripper command (−1 open … 1 closed) per physics step
 
 MUJOCO = tuple(int(part) for part in mujoco.__version__.split(".")[:2])
 FULLM_READS_DATA = MUJOCO >= (3, 10)
 """`mujoco.mj_fullM` takes (model, data, result); before MuJoCo 3.10 it took (model, result, data.qM)."""
-FULL_DEPTH_SINCE = (3, 4)
-"""First version of MuJoCo that reports the full depth of contacts between boxes."""
+FULL_DEPTH_SINCE = (3, 4)  # first version of MuJoCo that reports the full depth of contacts between boxes
 
 
 @cache
@@ -98,14 +92,11 @@ class Controller:
         self.gripper = np.zeros(2)
 
     def set_goal(self, data: mujoco.MjData, action: Array) -> None:
-        """Set the goal to the present pose moved by ``action[:6]``, clipped to [−1, 1].
-
-        A zero rotation keeps the previous goal's orientation, as in the published controller.
-        """
+        """Set the goal to the present pose moved by ``action[:6]``, clipped to [−1, 1]."""
         delta = np.clip(action[:6], -1.0, 1.0)
         self.goal_position = data.site_xpos[self._site] + delta[:3] * POSITION_SCALE
         rotation = delta[3:] * ROTATION_SCALE
-        if np.any(np.abs(rotation) > 0.0):
+        if np.any(np.abs(rotation) > 0.0):  # else the orientation stays, as in the published controller
             turn, present = _rotation_matrix(rotation), data.site_xmat[self._site].reshape(3, 3)
             # The product in this order: BLAS sums in another one on each processor.
             self.goal_rotation = turn[:, :1] * present[:1] + turn[:, 1:2] * present[1:2] + turn[:, 2:] * present[2:]
@@ -113,10 +104,7 @@ class Controller:
     def advance(
         self, data: mujoco.MjData, gripper_action: float, substeps: int = SUBSTEPS, *, gravity_only: bool = False
     ) -> None:
-        """Hold the goal over physics steps, or hold the arm against gravity only.
-
-        Before and after, ``data`` is in the state after `mujoco.mj_step1`.
-        """
+        """Hold the goal, or the arm against gravity only; ``data`` is in the state after `mj_step1`, as later."""
         change = CLOSING_SIGNS * (GRIPPER_SPEED * np.sign(gripper_action))
         gripper, site, jacobian, mass = self.gripper.copy(), self._site, self._jacobian, self._mass
         linear, angular = jacobian[:3], jacobian[3:]
@@ -136,35 +124,28 @@ class Controller:
         self.gripper = gripper
 
     def settle(self, data: mujoco.MjData, first: bool) -> None:
-        """Advance one control step without motion after a stored state of LIBERO's suites, with an open gripper.
-
-        Stock LIBERO does so with the MuJoCo of these states. Two facts differ from other control steps:
-
-        1. `set_init_state` moves the arm, and robosuite's controller reads the new pose only after the first physics
-           step, in which it exerts no torque but that against gravity. In the ``first`` control step it returns to the
-           pose of its reset.
-        2. Up to version 3.3, MuJoCo reports half the depth of contacts between boxes. In some states groceries are 29
-           mm inside the table; at full depth they would leave it twice as fast and be in the air after these steps.
-        """
+        """Advance one control step without motion after a stored state of LIBERO's suites, with an open gripper."""
+        # `set_init_state` moves the arm, and robosuite's controller reads the new pose only after the first physics
+        # step, in which it exerts no torque but that against gravity. In the first control step it returns to the pose
+        # of its reset.
         if not first:
             self.set_goal(data, np.zeros(6))
         for substep in range(SUBSTEPS):
+            # Stock LIBERO's MuJoCo reports half the depth of contacts between boxes. In some states groceries are 29 mm
+            # inside the table; at full depth they would leave it twice as fast and be in the air after these steps.
             if MUJOCO >= FULL_DEPTH_SINCE:
                 _halve_depth_of_boxes(self._model, data)
             self.advance(data, -1.0, 1, gravity_only=first and substep == 0)
 
 
 def _rotation_matrix(rotation_vector: Array) -> Array:
-    """Return the rotation (3, 3) about a vector by its length, rad.
-
-    The computation uses a single-precision quaternion like robosuite; in double precision the torques would differ in
-    the sixth digit.
-    """
+    """Return the rotation (3, 3) about a vector by its length, rad."""
     x, y, z = map(float, rotation_vector)
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-9:
         return np.eye(3)
     vector = math.sin(angle / 2) / angle * np.asarray(rotation_vector)
+    # In single precision like robosuite; in double precision the torques would differ in the sixth digit.
     quaternion = np.array([math.cos(angle / 2), *vector], dtype=np.float32)
     scale = math.sqrt(2.0 / float(sum(quaternion * quaternion)))
     quaternion = (quaternion.astype(np.float64) * scale).astype(np.float32)
@@ -182,11 +163,9 @@ def _rotation_matrix(rotation_vector: Array) -> Array:
 
 
 def _halve_depth_of_boxes(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Halve the depth of contacts between boxes in the reference acceleration of their constraints.
-
-    The impedance is that of the full depth, which is equal for contacts deeper than 2 mm.
-    """
+    """Halve the depth of contacts between boxes in the reference acceleration of their constraints."""
     boxes = (model.geom_type[data.contact.geom] == mujoco.mjtGeom.mjGEOM_BOX.value).all(axis=1)
     rows = data.contact.efc_address[boxes & (data.contact.efc_address >= 0)]
+    # The impedance is that of the full depth, which is equal for contacts deeper than 2 mm.
     stiffness, _, impedance, _ = data.efc_KBIP[rows].T
     data.efc_aref[rows] += 0.5 * stiffness * impedance * (data.efc_pos[rows] - data.efc_margin[rows])

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import xml.etree.ElementTree as ET
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
 import mujoco
 import numpy as np
@@ -43,7 +42,7 @@ from lerobot_memobench.sim.asset import (
 )
 from lerobot_memobench.sim.files import user_folders
 from lerobot_memobench.sim.visuals import drawing_model
-from lerobot_memobench.tasks.task import STRICT, Task
+from lerobot_memobench.tasks.task import STANDARD, STRICT, Task
 from mujoco_raster.drawlist import DrawList
 
 Array = NDArray[np.float64]
@@ -52,59 +51,38 @@ AGENTVIEW = "agentview"
 ARENA_BYTES = 32 * 2**20
 """Memory for contacts and constraints of one simulation. robosuite's files reserve it for 5,000 contacts, 1.3 GB; no
 scene uses 1 MB."""
-ZONE_HALF_HEIGHT = 0.007
-"""Half height of the site of a table region, m."""
+ZONE_HALF_HEIGHT = 0.007  # half height of the site of a table region, m
 FREE_DAMPING = "0.0005"
-GLOW_SITES = {"flat_stove": "burner"}
-"""Class -> site that LIBERO shows while an instance is on."""
-GLOW = "glow"
-"""Suffix of the name of the geom that replaces the site."""
+GLOW_SITES = {"flat_stove": "burner"}  # class -> site that LIBERO shows while an instance is on
+GLOW = "glow"  # suffix of the name of the geom that replaces the site
 GLOW_ON, GLOW_OFF = (0.9, 0.05, 0.05, 1.0), (0.9, 0.05, 0.05, 0.0)
 Y_UP = (0.5**0.5, -(0.5**0.5), 0.0, 0.0)
 """Rotation from the frame with z up to that of a body with y up, quaternion wxyz."""
-GRASP_DEPTH = 0.032
-"""Depth of a grasp below an object's top, m; fingers reach 4 cm below the palm."""
-MAX_GRASP_WIDTH = 0.068
-"""Largest width of a grasp, m."""
-CACHED_SCENES = 4
-"""Compiled scenes cached per process, some MB each; evaluation runs tasks one after another."""
+GRASP_DEPTH = 0.032  # depth of a grasp below an object's top, m; fingers reach 4 cm below the palm
+MAX_GRASP_WIDTH = 0.068  # largest width of a grasp, m
+CACHED_SCENES = 4  # compiled scenes cached per process, some MB each; evaluation runs tasks one after another
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A compiled scene. The model is shared; modify copies only."""
 
-    key: tuple[str, ...]
-    """Identifies the scene in caches; variants of a task share it."""
-    model: mujoco.MjModel
-    """The simulated model, without visual geoms."""
-    assets: dict[str, Asset]
-    """Instance name -> asset: objects, then fixtures without the table."""
+    model: mujoco.MjModel  # the simulated model, without visual geoms
+    assets: dict[str, Asset]  # instance name -> asset: objects, then fixtures without the table
     stand_ins: tuple[str, ...]
     """Published tasks: classes drawn by this package's objects because the paper's scans are not installed."""
     drawing: Callable[[], tuple[mujoco.MjModel, DrawList]]
     """Returns a visual model with equal bodies and joints, and its draw list."""
 
 
-_scenes: OrderedDict[tuple[str, ...], Scene] = OrderedDict()
-
-
 def get_scene(task: Task) -> Scene:
-    """Return the compiled scene of a task, cached per process.
-
-    Raises:
-        MemobenchError: LIBERO's assets are missing or have unexpected content, or a class of the task is unknown.
-    """
-    key = task.name, task.suite, task.bddl_text, *user_folders()
-    if key not in _scenes:
-        _scenes[key] = _build_scene(task, key)
-    _scenes.move_to_end(key)
-    while len(_scenes) > CACHED_SCENES:
-        _scenes.popitem(last=False)
-    return _scenes[key]
+    """Return the compiled scene of a task, cached per process; raise `MemobenchError` for missing or unknown files."""
+    # Variants of a task share their scene, at each difficulty.
+    return _build_scene(task.variant(0).at(STANDARD), user_folders())
 
 
-def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
+@lru_cache(maxsize=CACHED_SCENES)
+def _build_scene(task: Task, _folders: tuple[str, ...]) -> Scene:
     with _naming(task):
         spec = scene_spec(task)
         model = spec.compile()
@@ -119,7 +97,7 @@ def _build_scene(task: Task, key: tuple[str, ...]) -> Scene:
         with _naming(task):
             return drawing_model(scene_spec(task, visuals=True))
 
-    return Scene(key, model, assets, tuple(sorted(set(missing))), drawing)
+    return Scene(model, assets, tuple(sorted(set(missing))), drawing)
 
 
 @contextlib.contextmanager
@@ -192,7 +170,6 @@ def scene_xml(task: Task, visuals: bool) -> str:
 
 
 def _place_arm(world: ET.Element, arena: Arena) -> None:
-    """Move the arm to its place in an arena, and remove its mount in arenas without one."""
     base, mount = _body(world, "robot0_base"), _body(world, "mount0_base")
     x, y, z = arena.base
     if arena.mounted:
@@ -208,7 +185,6 @@ def _body(root: ET.Element, name: str) -> ET.Element:
 
 
 def _room(room: ET.Element, arena: Arena, task: Task) -> Iterator[ET.Element]:
-    """Yield the elements of an arena, with the table's layout from LIBERO's code and the task's regions."""
     for element in room.iterfind("worldbody/*"):
         if element.tag == "body" and element.get("name") == arena.body:
             if arena.lays_out:
@@ -240,7 +216,6 @@ def _lay_out(table: ET.Element, friction: tuple[float, float, float] | None) -> 
 
 
 def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
-    """Yield the sites of the table's regions, one for the first range of each."""
     x, y, z = arena.zones
     for name, region in task.regions.items():
         if task.fixtures.get(region.target) in ARENAS and region.ranges:
@@ -251,7 +226,6 @@ def _zones(arena: Arena, task: Task) -> Iterator[ET.Element]:
 
 
 def _room_assets(room: ET.Element, arena: Arena) -> Iterator[ET.Element]:
-    """Yield an arena's meshes, textures and materials, with floor and wall textures from LIBERO's code."""
     chosen = {"texplane": arena.floor, "tex-wall": arena.wall}
     for element in room.iterfind("asset/texture"):
         if element.get("name") in chosen:
@@ -321,12 +295,10 @@ def _asset(model: mujoco.MjModel, task: Task, name: str, class_name: str) -> Ass
         clear_radius=known.clear if contains else 0.0,
         round=known.round,
         upright=upright,
-        glow=(f"{name}_{GLOW}",) if class_name in GLOW_SITES else (),
     )
 
 
 def _by_the_sides(low: Triple, high: Triple) -> tuple[Grasp, ...]:
-    """Return grasps between opposite sides of a box, the narrower first."""
     x, y, z = (np.add(low, high) / 2).tolist()
     centre = (x, y, max(z, high[2] - GRASP_DEPTH))
     widths = {ALONG_X: high[0] - low[0], ALONG_Y: high[1] - low[1]}
@@ -358,8 +330,7 @@ def _bounds(model: mujoco.MjModel, root: int, upright: Quaternion | None) -> tup
 
 # --- detents ---
 
-DETENT_LEVER = 0.05
-"""Distance from a hinge to the spring's moving end, m."""
+DETENT_LEVER = 0.05  # distance from a hinge to the spring's moving end, m
 DETENT_OFFSET, DETENT_SLACK = 0.5, 2.5
 """Distance from the spring's fixed end to the path of the moving end, and the spring's rest length, in units of the
 distance from dead centre to the closed end."""
@@ -373,12 +344,10 @@ _DETENT_FORCE = {"drawer": 5.0, "door": 0.45, "knob": 0.15}
 
 
 def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
-    """Add to each drawer, door and knob a stop at its initial position and a spring that holds it there.
-
-    In the published scenes a drawer that was pushed closed is up to 5 mm deeper than an untouched one, and doors and
-    knobs rest where they are released, so images reveal past events. As in furniture, an over-centre spring near the
-    closed end presses the joint against its stop. Away from that end the spring is slack and motion is as published.
-    """
+    """Add to each drawer, door and knob a stop at its initial position and a spring that holds it there."""
+    # In the published scenes a drawer that was pushed closed is up to 5 mm deeper than an untouched one, and doors and
+    # knobs rest where they are released, so images reveal past events. As in furniture, an over-centre spring near the
+    # closed end presses the joint against its stop. Away from that end it is slack and motion is as published.
     for asset in assets.values():
         for articulation in asset.articulations.values():
             joint = spec.joint(articulation.joint)
@@ -391,7 +360,6 @@ def add_detents(spec: mujoco.MjSpec, assets: Mapping[str, Asset]) -> None:
 def _add_spring(
     spec: mujoco.MjSpec, fixture: mujoco.MjsBody, joint: mujoco.MjsJoint, articulation: Articulation
 ) -> None:
-    """Add the spring from a fixed point near the path of a point of the moving part to that point."""
     travel, press = DEAD_CENTRE[articulation.kind], _DETENT_FORCE[articulation.kind]
     lever = 1.0 if articulation.kind == "drawer" else DETENT_LEVER
     reach = travel * lever

@@ -21,7 +21,7 @@ from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
-from lerobot_memobench.sim.scene import AGENTVIEW, GLOW_OFF, GLOW_ON, Scene, get_scene
+from lerobot_memobench.sim.scene import AGENTVIEW, GLOW, GLOW_OFF, GLOW_ON, GLOW_SITES, Scene, get_scene
 from lerobot_memobench.sim.world import HiddenObject, HiddenObjects, StartState, World
 from lerobot_memobench.tasks.formula import SINCE_START, Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -38,16 +38,12 @@ MJCF_CAMERAS = {"agentview": AGENTVIEW, "wrist": robot.WRIST_CAMERA}
 STABILISATION_STEPS = 10  # objects start 1 to 8 cm above the table and fall in these steps
 SETTLED_SHIFT, SETTLED_SPEED = 0.01, 0.02
 """Largest horizontal shift of an object while a scene settles, m, and largest speed after it, m/s or rad/s."""
-MAX_SCENES = 200
-"""Maximum number of draws of a strict scene."""
-NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-"""No motion, gripper open."""
+MAX_SCENES = 200  # maximum number of draws of a strict scene
+NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # no motion, gripper open
 
 DEFAULT, HIGH = "default", "high"
-QUALITIES = (DEFAULT, HIGH)
-"""``high`` is for figures and videos: a pixel is the mean of four, at four times the cost."""
-CACHED_RASTERIZERS = 4
-"""Rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB."""
+QUALITIES = (DEFAULT, HIGH)  # ``high`` is for figures and videos: a pixel is the mean of four, at four times the cost
+CACHED_RASTERIZERS = 4  # rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB
 
 
 class InvalidActionError(MemobenchError):
@@ -59,11 +55,7 @@ class UnstablePhysicsError(MemobenchError):
 
 
 def as_action[F: np.floating](action: ArrayLike, dtype: type[F]) -> NDArray[F]:
-    """Return an action as a finite array (7,).
-
-    Raises:
-        InvalidActionError: the action is not numeric, has another shape, or is not finite.
-    """
+    """Return an action as a finite array (7,); raise `InvalidActionError` for another."""
     try:
         array: NDArray[F] = np.asarray(action, dtype=dtype)
     except (TypeError, ValueError):  # text, ragged lists, tensors of another device
@@ -87,12 +79,6 @@ class RenderSettings:
     width: int = 256
     quality: str = DEFAULT
 
-    def __post_init__(self) -> None:
-        if self.quality not in QUALITIES:
-            raise MemobenchError(f"render quality {self.quality!r} is unknown; {nearest(self.quality, QUALITIES)}")
-        if self.height < 1 or self.width < 1:
-            raise MemobenchError(f"frames of {self.height}×{self.width} pixels cannot be drawn; use sizes of 1 or more")
-
 
 class _RasterizerCache(threading.local):
     """Rasterizers of a thread, by scene and size; one serves one thread at a time."""
@@ -108,7 +94,7 @@ def get_rasterizer(scene: Scene, height: int, width: int) -> Rasterizer:
     """Return this thread's rasterizer of a scene, created on first use and shared by simulations of the scene."""
     from mujoco_raster.rasterizer import Rasterizer  # loads numba
 
-    key, cached = (scene.key, height, width), _cache.rasterizers
+    key, cached = (scene, height, width), _cache.rasterizers
     if key not in cached:
         while len(cached) >= CACHED_RASTERIZERS:
             cached.popitem(last=False)
@@ -125,10 +111,8 @@ class Snapshot:
     goal_position: Array
     goal_rotation: Array
     gripper: Array
-    goes_on: bool
-    """Whether the state continues its predecessor (`StartState.mark_step`)."""
-    hidden: tuple[HiddenObject, ...] = ()
-    """Objects outside the scene."""
+    goes_on: bool  # whether the state continues its predecessor (`StartState.mark_step`)
+    hidden: tuple[HiddenObject, ...] = ()  # objects outside the scene
 
 
 class Simulation:
@@ -154,8 +138,7 @@ class Simulation:
         self._start = StartState(self.model, self.data, tuple(task.objects), self.world.joints)
         self._hidden = HiddenObjects(self.model, self.data)
         self._at_home: Snapshot | None = None
-        self.caught_at_home = False
-        """Whether the detent at home caught the hand in the last step."""
+        self.caught_at_home = False  # whether the detent at home caught the hand in the last step
         self.settled = True
         """Whether objects rested where they were placed after `reset`. Some of LIBERO's placements do not."""
         self._begun: Snapshot | None = None
@@ -166,7 +149,7 @@ class Simulation:
         self._hand = self.model.body(robot.HAND_BODY).id
         self._grip = self.model.site(robot.GRIP_SITE).id
         self._full = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        self._glowing = [(asset, geom) for asset in scene.assets.values() for geom in asset.glow]
+        self._glowing = [name for name, asset in scene.assets.items() if asset.class_name in GLOW_SITES]
 
     # --- life -----------------------------------------------------------------------------------------------
 
@@ -178,21 +161,16 @@ class Simulation:
     ) -> None:
         """Sample the initial state of a seed, or set a stored one, and run the stabilisation steps.
 
-        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation. A strict scene is drawn
-        again, from the seed and the number of the draw, while an object is thrown or still moves after these steps.
+        Equal seeds of equal tasks give bit-equal states, independent of earlier simulation.
 
         Args:
             settling: called with `holds` after each stabilisation step.
-            state: initial state (state_dim,) of arm, objects and joints, as of `tasks.libero_suites`. The seed then
-                draws the poses of the fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset``
-                and ``set_init_state`` do.
-
-        Raises:
-            MemobenchError: the state has another shape, or each of `MAX_SCENES` draws of a strict scene has such an
-                object.
+            state: initial state (state_dim,), as of `catalogue.initial_states`. The seed then draws the poses of the
+                fixtures only, which a state does not contain, as LIBERO's ``seed``, ``reset`` and ``set_init_state``.
         """
         self._at_home, self.caught_at_home = None, False
         self._hidden.absent = ()
+        # A strict scene is drawn again while an object is thrown or still moves after the stabilisation.
         for draw in range(MAX_SCENES):
             self.settled = self._set_up(seed, draw, settling, state)
             if self.settled or not self._strict:
@@ -257,7 +235,11 @@ class Simulation:
         self._controller.advance(self.data, float(action[6]))
         self._check_physics(time)
         if self._hidden.absent:
-            self._update_hidden()
+            ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
+            revealed = self._hidden.reveal(ajar)
+            self._hidden.park()
+            mujoco.mj_step1(self.model, self.data)
+            self._start.mark_objects(revealed)
         closing = action[6] > 0.0  # closing the hand leaves the detent
         self.caught_at_home = False
         if self._at_home is not None and self._begun is not None and not closing and self._start.in_detent():
@@ -266,13 +248,6 @@ class Simulation:
                 self._put_back(self._begun)
             else:
                 self._put_back(self._at_home, arm_only=True)
-
-    def _update_hidden(self) -> None:
-        ajar = [hidden.region for hidden in self._hidden.absent if self._start.left_dead_centre(hidden.region)]
-        revealed = self._hidden.reveal(ajar)
-        self._hidden.park()
-        mujoco.mj_step1(self.model, self.data)
-        self._start.mark_objects(revealed)
 
     def _check_physics(self, time: float) -> None:
         """Raise for MuJoCo's warnings; without the check it silently continues from the model's initial state."""
@@ -284,11 +259,9 @@ class Simulation:
             raise UnstablePhysicsError(f"the physics broke down {time:.2f} s after the scene was set up: {warning}")
 
     def _put_back(self, start: Snapshot, arm_only: bool = False) -> None:
-        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller only.
-
-        Joint angles are restored, not only the hand's pose: the arm is redundant, and its configuration would reveal
-        its earlier motion.
-        """
+        """Restore a snapshot to the bit, except for the time: the whole scene, or arm, fingers and controller only."""
+        # Joint angles, not only the hand's pose: the arm is redundant, and its configuration would reveal its earlier
+        # motion.
         time, qpos, qvel = self.data.time, self.data.qpos.copy(), self.data.qvel.copy()
         absent = self._hidden.absent
         self.restore(start)
@@ -318,13 +291,9 @@ class Simulation:
         return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
 
     def set_state(self, state: Array, fixture_poses: dict[str, Array] | None = None) -> None:
-        """Set a recorded state for queries and rendering.
+        """Set a recorded state for queries and rendering; fixtures stay by default.
 
-        The previously set state counts as its predecessor (`StartState.mark_step`). Fixtures stay by default.
-
-        Raises:
-            MemobenchError: the state has another shape.
-            UnstablePhysicsError: MuJoCo reported a warning.
+        The previously set state counts as its predecessor (`StartState.mark_step`).
         """
         state = np.asarray(state, dtype=np.float64)
         if state.shape != (self.state_dim,):
@@ -371,16 +340,13 @@ class Simulation:
         mujoco.mj_step1(self.model, self.data)
 
     def end_prompt(self, start: Snapshot, hidden: Sequence[tuple[str, str]] = ()) -> None:
-        """Restore the state before a demonstration prompt, without the hidden objects.
-
-        Drawers and other objects are restored bit for bit: a displaced bottle would reveal the hand's path. Hidden
-        objects are absent until their drawers are ajar (`HiddenObjects`).
+        """Restore the state before a demonstration prompt, without the hidden objects (`HiddenObjects`).
 
         ``hidden``: pairs of object and region of the episode's variant; ``self.task`` is the published variant.
         """
         self.highlights = ()
         absent = tuple(self._hidden.describe(name, region) for name, region in hidden)
-        self.restore(start)
+        self.restore(start)  # bit for bit: a displaced bottle would reveal the hand's path
         self._hidden.absent = absent
         self._hidden.park()
         mujoco.mj_step1(self.model, self.data)
@@ -400,9 +366,9 @@ class Simulation:
 
         fine = self.render_settings.quality == HIGH
         with self._rasterizer(2 if fine else 1) as (rasterizer, model, data):
-            for asset, geom in self._glowing:
-                lit = self.holds(Atom("turnon", (asset.name,)))
-                model.geom(geom).rgba = GLOW_ON if lit else GLOW_OFF
+            for name in self._glowing:
+                lit = self.holds(Atom("turnon", (name,)))
+                model.geom(f"{name}_{GLOW}").rgba = GLOW_ON if lit else GLOW_OFF
             image = rasterizer.draw(model, data, _mjcf_camera(camera), self.highlights)
         return mean_of_four(image) if fine else image
 
@@ -516,10 +482,8 @@ def _mjcf_camera(camera: str) -> str:
 
 
 def axis_angle(quaternion: Array) -> Array:
-    """Return the rotation vector (3,) of a quaternion wxyz, computed as in robosuite and openpi.
-
-    The sign of the quaternion is kept: the result is continuous through a half turn, unlike a canonical form.
-    """
+    """Return the rotation vector (3,) of a quaternion wxyz, computed as in robosuite and openpi."""
+    # The quaternion's sign is kept: the result is continuous through a half turn, unlike a canonical form.
     w = float(np.clip(quaternion[0], -1.0, 1.0))
     norm = np.sqrt(1.0 - w * w)
     if norm < 1e-8:

@@ -24,17 +24,14 @@ from mujoco_raster.textures import LAYER_SIZE, pixels_of, resized
 
 Arrays = Mapping[str, NDArray[Any]]
 """Cached content of a file: a NumPy record, which loads in a third of the time of an archive."""
-CACHE_FORMAT = "8"
-"""Version of the cache files; increase it with each change of their content."""
+CACHE_FORMAT = "8"  # version of the cache files; increase it with each change of their content
 MESH_SETTINGS = ("scale", "refpos", "refquat", "smoothnormal", "inertia")
 TEXTURE_SETTINGS = ("type", "hflip", "vflip", "nchannel", "gridsize", "gridlayout")
 """Attributes of a file's mesh or texture on which cached content depends."""
 THIN_ABOVE, THIN_TO = 6000, 4000
 """Number of triangles above which meshes are simplified, and the target; an object covers a thousandth of an image."""
-MAX_THINNED_SIZE = 0.5
-"""Largest size of simplified meshes, m; larger ones are static and drawn once per scene."""
-MIN_NORMAL_COSINE = 0.96
-"""Smallest cosine between vertex and face normal of a smooth corner of a simplified mesh."""
+MAX_THINNED_SIZE = 0.5  # largest size of simplified meshes, m; larger ones are static and drawn once per scene
+MIN_NORMAL_COSINE = 0.96  # smallest cosine between vertex and face normal of a smooth corner of a simplified mesh
 PLACEHOLDER_POINTS = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
 PLACEHOLDER_FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Box placeholder of a mesh; the compiler does not change its frame."""
@@ -121,10 +118,7 @@ def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
 
 
 def _thinned(shape: Triangles) -> Triangles:
-    """Return a simplified shape with preserved texture seams.
-
-    Collapsed vertices take texture coordinates and normal of the nearest original vertex.
-    """
+    """Return a simplified shape with preserved texture seams."""
     points, normals, uv, triangles = shape
     if len(triangles) <= THIN_ABOVE or not uv.any() or np.ptp(points, axis=0).max() > MAX_THINNED_SIZE:
         return shape
@@ -141,6 +135,7 @@ def _thinned(shape: Triangles) -> Triangles:
     corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
     if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
         return shape
+    # Collapsed vertices take texture coordinates and normal of the nearest original vertex.
     distance = np.linalg.norm(spots - corners[moved], axis=1)
     order = np.lexsort((-distance, moved))  # the nearest vertex of each is written last
     nearest = np.zeros(len(corners), np.int64)

@@ -24,17 +24,14 @@ from lerobot_memobench.tasks.task import Task
 
 Array = NDArray[np.float64]
 
-ON_DISTANCE = 0.03
-"""Horizontal distance of origins below which one object counts as on another, m."""
-IN_SLACK = 0.01
-"""Distance below a region's lower bound at which an origin still counts as inside, m."""
+ON_DISTANCE = 0.03  # horizontal distance of origins below which one object counts as on another, m
+IN_SLACK = 0.01  # distance below a region's lower bound at which an origin still counts as inside, m
 ON_SITE_BELOW, ON_SITE_ABOVE = 0.005, 0.10
 """Distances below and above a site's top between which an origin counts as on it, m."""
 
 DETENT_DISTANCE = 0.02
 """Largest distance of the grip site from home for the detent, m; twice the error of learned policies."""
-DETENT_ANGLE = 0.1
-"""Largest rotation of the hand from home for the detent, rad."""
+DETENT_ANGLE = 0.1  # largest rotation of the hand from home for the detent, rad
 DETENT_OPENING = 0.01
 """Largest distance of each finger from home for the detent, m; excludes a hand that holds an object."""
 DETENT_SPEED = (0.03, 0.15)
@@ -43,10 +40,8 @@ the detent in one step."""
 SAME_STATE = 1e-4
 """Largest difference of positions and velocities (m, rad, m/s, rad/s) between equal states; states in files are
 rounded."""
-PLACE_DISTANCE = 0.01
-"""Largest distance of an object in place from its start, m; two pixels."""
-LIFTED_HEIGHT = 0.02
-"""Height above its start from which an object is lifted, m; more than a push raises it."""
+PLACE_DISTANCE = 0.01  # largest distance of an object in place from its start, m; two pixels
+LIFTED_HEIGHT = 0.02  # height above its start from which an object is lifted, m; more than a push raises it
 DETENT_SHIFT, DETENT_TURN = 0.001, 0.02
 """Largest distance (m) and angle (rad) of an object from its start for the detent to restore it."""
 
@@ -64,12 +59,11 @@ class World:
 
     def __init__(self, task: Task, model: mujoco.MjModel, data: mujoco.MjData, assets: dict[str, Asset]):
         self._task, self._model, self._data, self._assets = task, model, data, assets
-        self._instances = {name: index for index, name in enumerate(assets)}
-        self._table = len(self._instances)
+        self._index = {name: index for index, name in enumerate([*assets, TABLE])}
         # Owner of each geom: the instance at the root of its body's tree, −1 for robot and room.
-        roots = {model.body(name).id: index for name, index in self._instances.items()}
+        roots = {model.body(name).id: self._index[name] for name in assets}
         self._owner = np.array([roots.get(int(root), -1) for root in model.body_rootid[model.geom_bodyid]])
-        self._owner[[model.geom(geom).name.startswith(TABLE) for geom in range(model.ngeom)]] = self._table
+        self._owner[[model.geom(geom).name.startswith(TABLE) for geom in range(model.ngeom)]] = self._index[TABLE]
         self._owner[model.geom_group != COLLISION_GROUP] = -1
         self.joints: dict[str, tuple[Articulation, int]] = {}
         for name, asset in assets.items():
@@ -78,17 +72,13 @@ class World:
                 self.joints[f"{name}_{region}" if region else name] = (articulation, address)
 
     def holds(self, atom: Atom) -> bool:
-        """Return whether an atom is true now.
-
-        Raises:
-            MemobenchError: a name is not in the scene, or the predicate does not apply to it.
-        """
+        """Return whether an atom is true now; raise `MemobenchError` if the scene has no answer."""
         match atom.predicate:
             case "in":
                 return self._in(*atom.args)
             case "on":
                 a, b = atom.args
-                return self._on_object(a, b) if b in self._instances else self._on_site(a, b)
+                return self._on_object(a, b) if b in self._assets else self._on_site(a, b)
             case "open" | "close" | "turnon" | "turnoff":
                 return self._articulated(atom.predicate, atom.args[0])
         raise MemobenchError(
@@ -97,7 +87,7 @@ class World:
 
     def touching(self, a: str, b: str) -> bool:
         """Return whether two instances (or an instance and the table) are in contact."""
-        pair = {self._index(a), self._index(b)}
+        pair = {self._index[a], self._index[b]}
         if self._data.ncon == 0:
             return False
         owners = self._owner[self._data.contact.geom]
@@ -112,15 +102,6 @@ class World:
         articulation, address = self.joints[name]
         return articulation, float(self._data.qpos[address])
 
-    def _index(self, name: str) -> int:
-        if name == TABLE:
-            return self._table
-        if name not in self._instances:
-            raise MemobenchError(
-                f"task {self._task.name} has no object or fixture {name!r}; {nearest(name, self._instances)}"
-            )
-        return self._instances[name]
-
     def _articulated(self, predicate: str, name: str) -> bool:
         articulation, q = self.articulation(name)
         limit, holds = {
@@ -134,23 +115,20 @@ class World:
         return holds
 
     def _in(self, a: str, region: str) -> bool:
-        """LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`."""
-        self._index(a)
         point, (position, rotation, size) = self._data.body(a).xpos, self._box_of(region)
+        # LIBERO uses an axis-aligned box with half sides |R·size|, extended downwards by `IN_SLACK`.
         half = np.abs(rotation @ size)
         low, high = position - half, position + half
         low[2] -= IN_SLACK
         return bool(np.all(point > low) and np.all(point < high))
 
     def _on_object(self, a: str, b: str) -> bool:
-        self._index(a)
         above = self._data.body(a).xpos - self._data.body(b).xpos
         if above[2] < 0 or float(np.hypot(above[0], above[1])) >= ON_DISTANCE:
             return False
         return self.touching(a, b)
 
     def _on_site(self, a: str, region: str) -> bool:
-        self._index(a)
         position, rotation, size = self._box_of(region)
         # LIBERO applies the site's rotation where its inverse would be correct.
         offset = rotation @ (self._data.body(a).xpos - position)
@@ -158,20 +136,17 @@ class World:
         if not (above and np.all(np.abs(offset[:2]) < size[:2])):
             return False
         declared = self._task.regions.get(region)
-        on_table = declared is not None and declared.target not in self._instances
-        return on_table or self.touching(a, self._owner_of(region))
+        if declared is not None and declared.target not in self._assets:  # on the table no contact is needed
+            return True
+        return self.touching(a, max((name for name in self._assets if region.startswith(f"{name}_")), key=len))
 
     def _box_of(self, region: str) -> tuple[Array, Array, Array]:
-        """Return position (3,), rotation (3, 3) and half size (3,) of a region's site."""
         site = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_SITE, region)
         if site < 0:
             regions = [self._model.site(i).name for i in range(self._model.nsite)]
             raise MemobenchError(f"task {self._task.name} has no region {region!r}; {nearest(region, regions)}")
         data = self._data
         return data.site_xpos[site], data.site_xmat[site].reshape(3, 3), self._model.site_size[site]
-
-    def _owner_of(self, region: str) -> str:
-        return max((name for name in self._instances if region.startswith(f"{name}_")), key=len)
 
 
 class StartState:
@@ -236,11 +211,7 @@ class StartState:
             self._turns[name] = self._data.xquat[self._bodies[name]].copy()
 
     def holds(self, atom: Atom) -> bool:
-        """Return whether an atom of `SINCE_START` is true now.
-
-        Raises:
-            MemobenchError: ``ajar`` of a name that has no joint.
-        """
+        """Return whether an atom of `SINCE_START` is true now."""
         match atom.predicate, atom.args:
             case "handhome", ():
                 return self._is_or_was_equal(self._arm, self._arm_indices)
@@ -303,7 +274,6 @@ class StartState:
         return near and level and bool(np.all(np.abs(opening - self._opening) <= DETENT_OPENING))
 
     def _hand(self) -> tuple[Array, Array, Array]:
-        """Return position (3,) and rotation (3, 3) of the grip site, and finger positions (2,)."""
         data = self._data
         rotation = data.site_xmat[self._grip].reshape(3, 3).copy()
         return data.site_xpos[self._grip].copy(), rotation, data.qpos[robot.FINGERS].copy()
@@ -320,12 +290,9 @@ class HiddenObject:
     """An absent object."""
 
     name: str
-    region: str
-    """Region of its drawer."""
-    offset: Array
-    """Position relative to the region's site, (3,), m."""
-    quaternion: Array
-    """Orientation wxyz (4,)."""
+    region: str  # region of its drawer
+    offset: Array  # position relative to the region's site, (3,), m
+    quaternion: Array  # orientation wxyz (4,)
 
 
 class HiddenObjects:
@@ -338,8 +305,7 @@ class HiddenObjects:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
-        self.absent: tuple[HiddenObject, ...] = ()
-        """Objects that are parked."""
+        self.absent: tuple[HiddenObject, ...] = ()  # objects that are parked
 
     def describe(self, name: str, region: str) -> HiddenObject:
         """Return an object that rests in a drawer, with its present pose relative to the drawer."""

@@ -51,19 +51,12 @@ _KINDS: dict[str, tuple[tuple[str, ...], ...]] = {
 
 @dataclass(frozen=True)
 class Region:
-    """A named place on ``target``.
+    """A named place on ``target``, a fixture or object."""
 
-    Attributes:
-        name: inside the file; atoms use ``full_name``.
-        target: fixture (or object) that carries the region.
-        ranges: rectangles (x1, y1, x2, y2) relative to the target's centre, m; empty for a site of the target.
-        yaw: interval (low, high) of the initial yaw, rad.
-    """
-
-    name: str
+    name: str  # inside the file; atoms use ``full_name``
     target: str
-    ranges: tuple[tuple[float, float, float, float], ...] = ()
-    yaw: tuple[float, float] = (0.0, 0.0)
+    ranges: tuple[tuple[float, float, float, float], ...] = ()  # (x1, y1, x2, y2) from its centre, m; () for a site
+    yaw: tuple[float, float] = (0.0, 0.0)  # interval (low, high) of the initial yaw, rad
 
     @property
     def full_name(self) -> str:
@@ -73,11 +66,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Problem:
-    """A parsed BDDL file; names in ``init`` and ``goal`` are declared. Mappings keep the file's order.
-
-    Attributes:
-        unplaced: region on an undeclared target -> error message for atoms that use it.
-    """
+    """A parsed BDDL file; names in ``init`` and ``goal`` are declared. Mappings keep the file's order."""
 
     name: str
     domain: str
@@ -88,7 +77,7 @@ class Problem:
     objects_of_interest: tuple[str, ...]
     init: tuple[Atom, ...]
     goal: Formula
-    unplaced: dict[Region, str] = field(default_factory=dict)
+    unplaced: dict[Region, str] = field(default_factory=dict)  # on an undeclared target -> error of atoms that use it
 
     @property
     def scene(self) -> dict[str, Any]:
@@ -102,11 +91,7 @@ class Problem:
         return [*self.objects, *self.fixtures, *self.regions]
 
     def resolve(self, formula: Formula, where: str) -> Formula:
-        """Return ``formula`` with names in their declared spelling.
-
-        Raises:
-            MemobenchError: a name is not declared, or its kind does not fit the predicate.
-        """
+        """Return ``formula`` with names in their declared spelling, each of a kind that fits its predicate."""
         declared = {name.lower(): name for name in self.names}
         spelling: dict[str, str] = {}
         for atom in atoms(formula):
@@ -187,10 +172,10 @@ class _Node:
 
 
 def _parse(text: str, path: str) -> _Node:
-    """Return the single top-level list. The parser is iterative, so deep nesting cannot overflow the stack."""
+    """Return the single top-level list."""
     top_level: list[_Node] = []
     root = _Node(path, line=1, start=0, items=top_level)
-    stack, line, last = [root], 1, 0
+    stack, line, last = [root], 1, 0  # no recursion, which deep nesting would overflow
     for match in re.finditer(r"[()]|[^\s()]+", text):
         line += text.count("\n", last, match.start())
         last = match.start()
@@ -216,17 +201,13 @@ def _parse(text: str, path: str) -> _Node:
 
 
 def parse_bddl(text: str, path: object = "<text>") -> Problem:
-    """Parse a BDDL problem; ``path`` appears in error messages only.
-
-    Raises:
-        MemobenchError: with file, line, the unexpected item and the expected one.
-    """
+    """Parse a BDDL problem; ``path`` is named in error messages."""
     # Replace comments by spaces to preserve offsets and line numbers.
     text = re.sub(r";[^\n]*", lambda match: " " * len(match.group()), text)
     root = _parse(text, str(path))
     name, sections = _sections(root)
     items = {key: sections[key].sequence(key)[1:] if key in sections else [] for key in _SECTIONS}
-    names = _Names()
+    names: dict[str, tuple[str, str]] = {}
     problem = Problem(
         name=name,
         domain="",
@@ -238,13 +219,13 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
         init=(),
         goal=And(()),
     )
-    targets = names.spelling()
+    targets = {key: name for key, (_, name) in names.items()}
     for node in items[":regions"]:
         region, fault = _region(node, targets)
         if fault is not None:
             problem.unplaced[region] = fault
             continue
-        names.declare(node, region.full_name, "the region")
+        _declare(names, node, region.full_name, "the region")
         problem.regions[region.full_name] = region
     # These refer to the declarations, so they are parsed last.
     if ":domain" in sections and len(items[":domain"]) != 1:
@@ -254,7 +235,7 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
     return replace(
         problem,
         domain=items[":domain"][0].text("a domain name") if items[":domain"] else "",
-        objects_of_interest=tuple(names.declared(node) for node in items[":obj_of_interest"]),
+        objects_of_interest=tuple(_declared(names, node) for node in items[":obj_of_interest"]),
         goal=_formula(problem, items[":goal"][0]),
         init=_init(problem, sections[":init"]),
     )
@@ -289,32 +270,23 @@ def _language(text: str, section: _Node) -> str:
     return language
 
 
-class _Names:
-    """Case-insensitive registry of declared names; rejects names that differ only in case."""
-
-    def __init__(self) -> None:
-        self._kinds: dict[str, tuple[str, str]] = {}
-
-    def declare(self, node: _Node, name: str, kind: str) -> None:
-        """Add a name; ``kind`` describes it in the error for a second declaration."""
-        if name.lower() in self._kinds:
-            first = " ".join(self._kinds[name.lower()])
-            raise node.error(f"the name {name!r} declared again", f"another name, because {first} exists")
-        self._kinds[name.lower()] = (kind, name)
-
-    def spelling(self) -> dict[str, str]:
-        """Return lower-case name -> declared name."""
-        return {key: name for key, (_, name) in self._kinds.items()}
-
-    def declared(self, node: _Node) -> str:
-        """Return the declared spelling of a name of interest."""
-        known, name = self.spelling(), node.text("a declared name")
-        if name.lower() not in known:
-            raise node.error(f"{name!r} in :obj_of_interest", f"a declared name, {nearest(name, known.values())}")
-        return known[name.lower()]
+def _declare(names: dict[str, tuple[str, str]], node: _Node, name: str, kind: str) -> None:
+    """Add a name to {lower case: (kind, name)}; ``kind`` describes it in the error for a second declaration."""
+    if name.lower() in names:
+        first = " ".join(names[name.lower()])
+        raise node.error(f"the name {name!r} declared again", f"another name, because {first} exists")
+    names[name.lower()] = kind, name
 
 
-def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
+def _declared(names: dict[str, tuple[str, str]], node: _Node) -> str:
+    name = node.text("a declared name")
+    if name.lower() not in names:
+        known = [known for _, known in names.values()]
+        raise node.error(f"{name!r} in :obj_of_interest", f"a declared name, {nearest(name, known)}")
+    return names[name.lower()][1]
+
+
+def _declarations(nodes: list[_Node], names: dict[str, tuple[str, str]]) -> dict[str, str]:
     """Parse ``a b - class c - class`` into {instance: class}."""
     expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
     declared: dict[str, str] = {}
@@ -330,7 +302,7 @@ def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
             lacking = "a class after it" if waiting else "a name before it"
             raise node.error(f"a '-' without {lacking}", expected)
         for name in waiting:
-            names.declare(name, name.word, f"the {class_name}")
+            _declare(names, name, name.word, f"the {class_name}")
             declared[name.word] = class_name
         waiting = []
     if waiting:
@@ -339,7 +311,6 @@ def _declarations(nodes: list[_Node], names: _Names) -> dict[str, str]:
 
 
 def _region(node: _Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
-    """Return a region, and the error message for an undeclared target."""
     items = node.sequence(_REGION)
     if not items:
         raise node.error("an empty list ()", _REGION)

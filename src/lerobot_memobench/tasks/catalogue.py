@@ -1,24 +1,28 @@
 """List and load the 30 published and 30 strict tasks, LIBERO's 130, and task folders in the published format.
 
 A task folder holds ``task_config.bddl`` and ``task_config.meta.json``. Values missing from published metadata are
-inferred from the folder name and the instruction.
+inferred from the folder name and the instruction. LIBERO's tasks have no checkpoints, prompt or variants, but 50
+initial states each.
 """
 
 from __future__ import annotations
 
+import io
+import json
 import re
+import zipfile
 from collections import Counter
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.io import existing_spelling, files_below
 from lerobot_memobench.tasks.bddl import Problem, parse_bddl
 from lerobot_memobench.tasks.formula import LATCHES, atoms, to_lists
-from lerobot_memobench.tasks.gap import gaps
-from lerobot_memobench.tasks.libero_suites import FOLDER as LIBERO_FOLDER
-from lerobot_memobench.tasks.libero_suites import get_libero_task, libero_tasks
 from lerobot_memobench.tasks.metadata import Metadata
 from lerobot_memobench.tasks.task import (
     BDDL_FILE,
@@ -26,8 +30,10 @@ from lerobot_memobench.tasks.task import (
     MEMORY_TYPES,
     METADATA_FILE,
     PUBLISHED,
+    STRICT,
     SUITES,
     Checkpoint,
+    LiberoSuite,
     MemoryType,
     Prompt,
     PromptKind,
@@ -37,6 +43,8 @@ from lerobot_memobench.untrusted import refusing
 
 #: <suite>/<memory type>/<task name>/{task_config.bddl, task_config.meta.json}; names are unique over all suites.
 CATALOGUE_DIR = Path(__file__).parent / "catalogue"
+LIBERO_FOLDER = Path(__file__).parent / "libero"
+"""<suite>.zip: BDDL file and initial states of each task, in LIBERO's order; ``scripts/libero_suites.py`` writes it."""
 
 ALL_SUITES: tuple[str, ...] = (*SUITES, *LIBERO_SUITES)
 GROUPS: tuple[str, ...] = (*MEMORY_TYPES, *LIBERO_SUITES)
@@ -63,19 +71,17 @@ class _Entry(NamedTuple):
 @cache
 def _entries() -> dict[str, _Entry]:
     """Task name -> entry, by suite, memory type (temporal, spatial, object, procedural), then by name."""
-    folders = [
-        folder
-        for suite in SUITES
-        for memory_type in MEMORY_TYPES
-        for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir())
-        if (folder / BDDL_FILE).is_file()
-    ]
-    entries = {
-        folder.name: _Entry(folder.parents[1].name, folder.parent.name, k, folder) for k, folder in enumerate(folders)
-    }
-    for suite in LIBERO_SUITES:
-        archive = LIBERO_FOLDER / f"{suite}.zip"
-        entries |= {name: _Entry(suite, suite, k, archive / name) for k, name in enumerate(libero_tasks(suite))}
+    entries: dict[str, _Entry] = {}
+    for suite in SUITES:
+        for memory_type in MEMORY_TYPES:
+            for folder in sorted((CATALOGUE_DIR / suite / memory_type).iterdir()):
+                if (folder / BDDL_FILE).is_file():
+                    entries[folder.name] = _Entry(suite, memory_type, len(entries), folder)
+    for libero in LIBERO_SUITES:
+        archive = LIBERO_FOLDER / f"{libero}.zip"
+        with zipfile.ZipFile(archive) as content:
+            names = [file.removesuffix(".bddl") for file in content.namelist() if file.endswith(".bddl")]
+        entries |= {name: _Entry(libero, libero, k, archive / name) for k, name in enumerate(names)}
     return entries
 
 
@@ -91,7 +97,7 @@ def suite_of(name: str) -> str | None:
 
 
 def group_of(name: str) -> str:
-    """Return the memory type of a catalogue task, for a task of LIBERO its suite; raises as `task_folder`."""
+    """Return the memory type of a catalogue task, for a task of LIBERO its suite."""
     return _entry(name).group
 
 
@@ -117,6 +123,11 @@ def task_index(name: str) -> int:
     return _entry(name).number
 
 
+def libero_id(name: str) -> int | None:
+    """Return LIBERO's id of a task, its index in its suite; None for a task that is not LIBERO's."""
+    return task_index(name) if suite_of(name) in LIBERO_SUITES else None
+
+
 def task_number(name: str) -> int:
     """Return the number of a task within its suite, in catalogue order; LIBERO's begin with 0."""
     suite = _entry(name).suite
@@ -128,18 +139,18 @@ def _first_number(suite: str) -> int:
 
 
 def task_folder(name: str) -> Path:
-    """Return the folder of a catalogue task, for a task of LIBERO its place in an archive; `load_task` reads both.
-
-    Raises:
-        MemobenchError: the name is unknown; the nearest names are given.
-    """
+    """Return the folder of a catalogue task, for a task of LIBERO its place in an archive; `load_task` reads both."""
     return _entry(name).folder
 
 
 @cache
 def get_task(name: str) -> Task:
-    """Return a catalogue task; raises as `task_folder`."""
-    return load_task(task_folder(name))
+    """Return a catalogue task; raise `MemobenchError` with the nearest names for an unknown one."""
+    entry = _entry(name)
+    return _libero_task(entry) if entry.suite in LIBERO_SUITES else load_task(entry.folder)
+
+
+# --- selection ---
 
 
 def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
@@ -188,7 +199,6 @@ def resolve_tasks(spec: str, suite: str = PUBLISHED) -> list[str]:
 
 
 def _numbered(word: str, names: list[str], suite: str, listing: str) -> list[str]:
-    """Return the tasks of a number, or of an inclusive range of numbers."""
     numbers, lowest = re.fullmatch(r"(\d+)(?:-(\d+))?", word), _first_number(suite)
     first, last = (-1, -1) if numbers is None else (int(numbers[1]), int(numbers[2] or numbers[1]))
     if not lowest <= first <= last < lowest + len(names):
@@ -237,6 +247,9 @@ def lerobots_choice(task: str | None, task_ids: Any, suite: str, tasks: str) -> 
     return suites, ",".join(map(str, task_ids))
 
 
+# --- listing ---
+
+
 def task_record(task: Task, state_dim: int) -> dict[str, Any]:
     """Return the entry of ``memobench tasks --json``; ``state_dim`` is 1 + nq + nv of the compiled model."""
     return {
@@ -257,7 +270,7 @@ def task_record(task: Task, state_dim: int) -> dict[str, Any]:
             }
             for checkpoint in task.checkpoints
         ],
-        "gaps": [None if gap is None else gap._asdict() for gap in gaps(task)],
+        "gaps": [None if distance is None else distance._asdict() for distance in cue_to_use(task)],
         "state_dim": int(state_dim),
     }
 
@@ -267,6 +280,104 @@ def _by_class(instances: dict[str, str]) -> dict[str, list[str]]:
     for instance, class_name in instances.items():
         by_class.setdefault(class_name, []).append(instance)
     return by_class
+
+
+CUE_TO_USE_FILE = Path(__file__).with_name("cue_to_use.json")
+"""Measured by ``scripts/cue_to_use.py`` on the scripted expert; ``docs/benchmark/gap.md`` defines it."""
+
+
+class CueToUse(NamedTuple):
+    """Control steps from the cue of a checkpoint to its use over the expert's episodes, without holds.
+
+    ``held``: whether the first hold lies between cue and use.
+    """
+
+    least: int
+    median: int
+    most: int
+    held: bool
+
+    def __str__(self) -> str:
+        return f"{self.median} + hold" if self.held else str(self.median)
+
+
+def cue_in_prompt(task: Task, checkpoint: int) -> bool:
+    """Return whether the demonstration prompt shows the answer to a checkpoint (0 is the first)."""
+    # After a hiding, only the first choice, the drawer, depends on the prompt.
+    return task.prompt is not None and (task.prompt.kind != "hide" or checkpoint == 0)
+
+
+def cue_to_use(task: Task) -> tuple[CueToUse | None, ...]:
+    """Return the steps of each checkpoint, () for a task that was not measured; None: nothing has to be remembered."""
+    return tuple(
+        None if row is None else CueToUse(*row, held=task.suite == STRICT and cue_in_prompt(task, k))
+        for k, row in enumerate(_measured_cues().get(task.name, []))
+    )
+
+
+def longest_cue_to_use(task: Task) -> CueToUse | None:
+    """Return the largest median of a task's checkpoints; None for a task without one or not measured."""
+    known = [distance for distance in cue_to_use(task) if distance is not None]
+    return max(known, key=lambda distance: (distance.held, distance.median), default=None)
+
+
+@cache
+def _measured_cues() -> dict[str, list[tuple[int, int, int] | None]]:
+    rows: dict[str, list[tuple[int, int, int] | None]] = json.loads(CUE_TO_USE_FILE.read_text())
+    return rows
+
+
+# --- LIBERO's suites ---
+
+NUM_STATES = 50  # initial states of each of LIBERO's tasks; episode i starts in state i
+STEP_LIMITS: dict[LiberoSuite, int] = {
+    "libero_spatial": 280,
+    "libero_object": 280,
+    "libero_goal": 300,
+    "libero_10": 520,
+    "libero_90": 400,
+}
+"""Control steps of an episode, those of LeRobot's LIBERO environment."""
+
+
+def _libero_task(entry: _Entry) -> Task:
+    """Return a LIBERO task, with the instruction that LIBERO and LeRobot derive from its name, not the file's."""
+    name, suite = entry.folder.name, cast("LiberoSuite", entry.suite)
+    text = _archived(entry, ".bddl").decode()
+    words = name.split("_")
+    scenes = [index for index, word in enumerate(words) if word.startswith("SCENE")]
+    return Task(
+        name=name,
+        memory_type=suite,
+        family=suite,
+        language=" ".join(words[scenes[0] + 1 :] if name[0].isupper() and scenes else words),
+        **parse_bddl(text, f"{entry.folder}.bddl").scene,
+        folder=entry.folder,
+        bddl_text=text,
+        suite=suite,
+    )
+
+
+@lru_cache(maxsize=8)
+def initial_states(name: str) -> NDArray[np.float64]:
+    """Return the initial states of a LIBERO task, (50, 1 + nq + nv), read-only: time, positions and velocities."""
+    states: NDArray[np.float64] = np.load(io.BytesIO(_archived(_entry(name), ".npy")), allow_pickle=False)
+    states.flags.writeable = False
+    return states
+
+
+def _archived(entry: _Entry, suffix: str) -> bytes:
+    with zipfile.ZipFile(entry.folder.parent) as archive:
+        return archive.read(f"{entry.folder.name}{suffix}")
+
+
+def check_states(suite: str, first: int, episodes: int) -> None:
+    """Raise `MemobenchError` unless the tasks of a suite have the initial states of ``episodes`` from ``first`` on."""
+    if not 0 <= first <= first + episodes <= NUM_STATES:
+        raise MemobenchError(
+            f"found the initial states {first} to {first + episodes - 1}, and tasks of {suite} have {NUM_STATES} "
+            f"initial states, 0 to {NUM_STATES - 1}: ask for at most {NUM_STATES} episodes, and leave seed_base out"
+        )
 
 
 # --- task folders ---
@@ -304,7 +415,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     """
     folder = Path(folder).resolve()
     if folder.parent.parent == LIBERO_FOLDER.resolve():  # a place in an archive, see `task_folder`
-        return get_libero_task(folder.name)
+        return get_task(folder.name)
     if not folder.is_dir():
         raise MemobenchError(f"{folder} is not a folder, expected a task folder with {BDDL_FILE} and {METADATA_FILE}")
     bddl, path = existing_spelling(folder / BDDL_FILE), existing_spelling(folder / METADATA_FILE)
@@ -359,13 +470,10 @@ def _infer_prompt(memory_type: MemoryType, problem: Problem, checkpoints: tuple[
 
 
 def _infer_referent(problem: Problem, checkpoints: tuple[Checkpoint, ...]) -> str | None:
-    """Return the prompt's object, from the first checkpoint that names objects, else from the goal.
-
-    Prefer the first object with siblings of its class, which could be confused, over the first object.
-    """
+    """Return the prompt's object, from the first checkpoint that names objects, else from the goal."""
     siblings = Counter(problem.objects.values())
     for formula in (*(checkpoint.goal for checkpoint in checkpoints), problem.goal):
         objects = [arg for atom in atoms(formula) for arg in atom.args if arg in problem.objects]
-        if objects:
+        if objects:  # prefer one with siblings of its class, which could be confused
             return next((arg for arg in objects if siblings[problem.objects[arg]] > 1), objects[0])
     return None

@@ -1,6 +1,6 @@
 """Define, build, check, traverse and format formulas of goals and checkpoints: trees of operators over atoms.
 
-The published tasks use four operators; the strict suite adds five. The simulator evaluates atoms. `tasks.nodes`
+The published tasks use four operators; the strict suite adds five. The simulator evaluates atoms. `tasks.progress`
 implements operators and latches (``wasopen``, ``wasturnedon``) over time, see ``docs/benchmark/formulas.md``.
 """
 
@@ -35,11 +35,9 @@ LATCHES: dict[str, str] = {"wasopen": "open", "wasturnedon": "turnon"}
 #: Predicates that compare the present with the start of the execution; invalid in ``:init``.
 SINCE_START = frozenset({"handhome", "asbegun", "ajar", "inplace", "lifted"})
 
-#: Largest number in a formula: more steps than any episode has.
-MAX_NUMBER = 100_000
+MAX_NUMBER = 100_000  # largest number in a formula: more steps than any episode has
 
-#: Maximum nesting depth; bounds recursion on malformed files.
-MAX_DEPTH = 40
+MAX_DEPTH = 40  # maximum nesting depth; bounds recursion on malformed files
 
 
 @dataclass(frozen=True)
@@ -252,7 +250,6 @@ def parse_formula(value: Any, where: str = "formula", depth: int = 0) -> Formula
 
 
 def _from_object(value: Mapping[Any, Any], where: str) -> tuple[str, Sequence[Any]]:
-    """Return the operator of a JSON object and its operands."""
     if len(value) != 1:
         raise MemobenchError(f"{where}: found an object with {len(value)} keys, expected one of {_KEYS}")
     ((head, rest),) = value.items()

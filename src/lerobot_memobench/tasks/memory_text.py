@@ -14,8 +14,7 @@ from itertools import pairwise
 from lerobot_memobench.tasks.task import DEFAULT_LEVEL, Task
 
 SEPARATOR = "; "
-MARK = " Memory: "
-"""Separator between instruction and memory text in a prompt."""
+MARK = " Memory: "  # separator between instruction and memory text in a prompt
 NOTHING_YET = "nothing yet"
 
 
@@ -89,7 +88,6 @@ def _subtask(text: str, before: str) -> str:
 
 
 def _expand_first_match(patterns: Sequence[tuple[str, str]], text: str) -> str:
-    """Return the expansion of the first matching pattern, else the text unchanged."""
     for pattern, template in patterns:
         match = re.fullmatch(pattern, text)
         if match:

@@ -61,21 +61,13 @@ class VariantData(TypedDict):
 
 
 class MetadataFile(TypedDict):
-    """The file. The last seven keys belong to this project, not to the published format.
+    """The file: K entries in each list. The last seven keys are this project's, not the published format's."""
 
-    Attributes:
-        memory: K lists of three texts: coarse, intermediate, fine.
-        operating_type: K lists of three labels: 0 Storage, 1 Update, 2 Compression.
-        subtask_goals: K formulas.
-        key_frame: K frame indices, -1 if unknown.
-        timestep_exec_start_idx: first frame of the execution in each demonstration.
-    """
-
-    memory: list[LevelTexts]
-    operating_type: list[LevelLabels]
-    subtask_goals: Annotated[list[Any], MinLen(1)]
-    key_frame: NotRequired[list[int]]
-    timestep_exec_start_idx: NotRequired[int | list[int]]
+    memory: list[LevelTexts]  # coarse, intermediate, fine
+    operating_type: list[LevelLabels]  # 0 Storage, 1 Update, 2 Compression
+    subtask_goals: Annotated[list[Any], MinLen(1)]  # formulas
+    key_frame: NotRequired[list[int]]  # -1 if unknown
+    timestep_exec_start_idx: NotRequired[int | list[int]]  # first frame of the execution in each demonstration
     demo_summary: NotRequired[str]
     memory_type: NotRequired[MemoryType]
     family: NotRequired[str]
@@ -88,15 +80,11 @@ class MetadataFile(TypedDict):
 
 
 class Metadata:
-    """Content of a metadata file; its methods raise `MemobenchError` with file and key.
-
-    ``path``: None for a task without metadata, which has no checkpoints. ``problem``: BDDL problem of the same folder,
-    which declares the names. ``data``: a `MetadataFile`, or {}.
-    """
+    """Content of a metadata file; its methods raise `MemobenchError` with file and key."""
 
     def __init__(self, path: Path | None, problem: Problem) -> None:
-        self.path, self.problem = path, problem
-        self.data: dict[str, Any] = {}
+        self.path, self.problem = path, problem  # None: no checkpoints; the problem declares the names
+        self.data: dict[str, Any] = {}  # a `MetadataFile`, or empty without one
         if path is not None:
             try:
                 self.data = read_json(path, MetadataFile, ADVICE)

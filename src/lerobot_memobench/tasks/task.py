@@ -28,7 +28,7 @@ MEMORY_TYPES: tuple[MemoryType, ...] = get_args(MemoryType)
 OPERATIONS: tuple[Operation, ...] = get_args(Operation)
 SUITES: tuple[Suite, ...] = get_args(Suite)
 PUBLISHED, STRICT = SUITES
-#: LIBERO's own suites (`tasks.libero_suites`), whose tasks have no checkpoints.
+#: LIBERO's own suites (`tasks.catalogue`), whose tasks have no checkpoints.
 LIBERO_SUITES: tuple[LiberoSuite, ...] = get_args(LiberoSuite)
 #: Difficulty of strict tasks -> largest number of repetitions that a counting task asks for. Each one draws from the
 #: variants of the easier ones and its own (`Variant.difficulty`).
@@ -36,8 +36,7 @@ REPETITIONS: dict[Difficulty, int] = {"easy": 2, "standard": 3, "hard": 5, "extr
 DIFFICULTIES = tuple(REPETITIONS)
 EASY, STANDARD = DIFFICULTIES[:2]
 REFERENTS = ("fixed", "random")
-#: Referent of strict episodes, which ignore the referent setting (`Task.drawn`).
-DRAWN = "drawn"
+DRAWN = "drawn"  # referent of strict episodes, which ignore the referent setting (`Task.drawn`)
 #: Control steps of a strict task's prompt per object shown, equal for all variants. The slowest of some 700 prompts
 #: used five sixths of them; the scene rests for the remainder.
 STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "pick": 300, "routine": 300, "hide": 600}
@@ -45,8 +44,7 @@ STRICT_PROMPT_STEPS: dict[PromptKind, int] = {"highlight": 100, "point": 300, "p
 #: was searched in a wrong place; the events or the place were right, and the hand failed.
 MISCOUNT, WRONG_PLACE, HAND = STRICT_FAILURES = ("miscount", "wrong_place", "hand")
 LEVELS = ("coarse", "intermediate", "fine")
-#: Level of the evaluated operation labels (paper: intermediate).
-DEFAULT_LEVEL = 1
+DEFAULT_LEVEL = 1  # level of the evaluated operation labels (paper: intermediate)
 
 BDDL_FILE = "task_config.bddl"
 METADATA_FILE = "task_config.meta.json"
@@ -58,10 +56,8 @@ def referent_text(requested: str, drawn: bool) -> str:
 
 
 def horizon_of(difficulty: str) -> int:
-    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown.
-
-    As many per repetition as in the standard suite, and not less in all.
-    """
+    """Return the execution steps per episode of a difficulty; raise `MemobenchError` if it is unknown."""
+    # As many per repetition as in the standard suite, and not less in all.
     check_choice("difficulty", difficulty, DIFFICULTIES)
     return max(HORIZON, HORIZON * REPETITIONS[cast("Difficulty", difficulty)] // REPETITIONS[STANDARD])
 
@@ -155,13 +151,13 @@ class Task:
     init: tuple[Atom, ...]
     objects_of_interest: tuple[str, ...]
     goal: Formula
-    checkpoints: tuple[Checkpoint, ...]
-    prompt: Prompt | None
-    variants: tuple[Variant, ...]
-    demo_summary: str
     folder: Path
     bddl_text: str = field(repr=False)
-    metadata: dict[str, Any] = field(repr=False)
+    metadata: dict[str, Any] = field(default_factory=dict, repr=False)
+    checkpoints: tuple[Checkpoint, ...] = ()
+    prompt: Prompt | None = None
+    variants: tuple[Variant, ...] = ()
+    demo_summary: str = ""
     variant_index: int = 0
     published: Task | None = field(default=None, repr=False)
     suite: Suite | LiberoSuite = "published"

@@ -21,12 +21,12 @@ from lerobot_memobench.commands.command_line import (
     TYPE,
     CommandSettings,
     as_command_line,
+    call_lerobot,
     read_words,
     resolve_recipe,
     value_of,
     without,
 )
-from lerobot_memobench.commands.lerobot_commands import call_lerobot
 from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
@@ -41,7 +41,9 @@ from lerobot_memobench.policies.checkpoint import (
     as_trained,
     check_as_begun,
     check_checkpoint,
+    check_device,
     check_processors,
+    check_sizes,
     check_weights,
     checkpoint_folder,
     checkpoint_type,
@@ -49,10 +51,10 @@ from lerobot_memobench.policies.checkpoint import (
     differing,
     local_folder,
     looks_local,
+    quiet,
     read_checkpoint_json,
     text_of_link,
 )
-from lerobot_memobench.policies.lerobot_config import check_device, check_sizes, quiet
 from lerobot_memobench.untrusted import check_fetched
 
 if TYPE_CHECKING:
@@ -76,8 +78,8 @@ READ = frozenset(
 )
 """Fields of LeRobot's configuration that the loop of memory policies reads, itself or through LeRobot's functions."""
 TRAINING_STEP = Path("training_state") / "training_step.json"
-OF_OPTIMIZER = ("optimizer.", "policy.optimizer_")
-"""Beginnings of settings that a saved optimizer overrides."""
+FIXED = ("dataset.episodes", "dataset.revision", "optimizer.", "policy.optimizer_")
+"""Beginnings of settings that a resumed training keeps; a saved optimizer overrides its own."""
 NOT_COMPARED = {
     *("dataset.root", "dataset.repo_id", "log_freq", "num_workers", "output_dir", "resume", "save_freq", "steps")
 }
@@ -139,22 +141,16 @@ def locked_run(folder: str | None) -> Iterator[None]:
 
 
 def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | None, dict[str, str]]:
-    """Split off the options that LeRobot does not have.
+    """Return the options that LeRobot does not have, each None if it is not given, and the other words.
 
-    Returns:
-        Whether frames of demonstration prompts are trained on, the kind of observation (each None if it is not given),
-        and the other words.
-
-    Raises:
-        MemobenchError: an option has an unknown value.
+    The options are whether frames of demonstration prompts are trained on, and the kind of observation.
     """
-    obs_type = words.get("obs_type")
+    prompts: bool | None = value_of("prompt_frames", bool | None, words.get("prompt_frames", "null"))
+    obs_type, rest = words.get("obs_type"), without(words, *TRAINING_OPTIONS)
     if obs_type is not None:
         check_choice("obs_type", obs_type, OBS_TYPES)
-    prompts: bool | None = value_of("prompt_frames", bool | None, words.get("prompt_frames", "null"))
-    rest = without(words, *TRAINING_OPTIONS)
-    if obs_type is not None and "env" in words:  # it is a setting of the environment, too
-        rest["obs_type"] = obs_type
+        if "env" in words:  # it is a setting of the environment, too
+            rest["obs_type"] = obs_type
     return prompts, obs_type, rest
 
 
@@ -162,12 +158,7 @@ def take_training_options(words: Mapping[str, str]) -> tuple[bool | None, str | 
 
 
 def complete_training(requested: CommandSettings, notify: Callable[[str], None] = print) -> TrainPipelineConfig:
-    """Return the configuration of a training with the benchmark's defaults, checked and completed by LeRobot.
-
-    Raises:
-        MemobenchError: no policy is named, settings do not go together, the dataset or the checkpoint cannot be used,
-            or a resumed training has other settings.
-    """
+    """Return the configuration of a training with the benchmark's defaults, checked and completed by LeRobot."""
     if not (requested.get("policy") or requested.get("reward_model")):
         raise MemobenchError("name a policy: policy=memobench_mem")
     requested = requested.default("dataset.repo_id", DEFAULT_REPO_ID)
@@ -190,7 +181,11 @@ def complete_training(requested: CommandSettings, notify: Callable[[str], None] 
         check_same_training(requested, config, config.checkpoint_path, notify)
     if policy is not None:
         check_sizes(policy)
-        check_memory_settings(requested, policy)
+    given = requested.words.get("policy.memory_settings")  # a checkpoint may hold those of another memory
+    if given and (memory := getattr(policy, "memory", "none")) != "none":
+        from lerobot_memobench.policies.memobench_mem.memory import mechanism_settings
+
+        mechanism_settings(memory, value_of("policy.memory_settings", dict[str, Any], given))
     if path is not None:
         with quiet():
             trained = as_trained(path, policy)
@@ -241,11 +236,7 @@ def with_memory_defaults(requested: CommandSettings) -> CommandSettings:
 
 
 def check_with_lerobot(config: TrainPipelineConfig, requested: CommandSettings) -> None:
-    """Let LeRobot check a configuration and complete its folder, job, optimizer and resumed checkpoint.
-
-    Raises:
-        MemobenchError: LeRobot refuses it, or the folder of a new training exists.
-    """
+    """Let LeRobot check a configuration and complete its folder, job, optimizer and resumed checkpoint."""
     if not config.resume and config.output_dir is not None and config.output_dir.is_dir():
         with locked_run(requested.get("output_dir")):  # a training that is running there is the better reason
             raise MemobenchError(
@@ -272,15 +263,14 @@ def check_settings(config: TrainPipelineConfig) -> None:
             raise MemobenchError(f"{setting}={changed} has no effect on policy={policy.type}; leave it out")
     encodes_ahead = policy.uses_detector or policy.uses_visual_encoder
     encoded = config.dataset.image_transforms.enable and encodes_ahead
-    refused = [
-        (config.dataset.streaming, "dataset.streaming=true", "memory needs all frames of an episode"),
-        (policy.use_amp, "policy.use_amp=true", "policy.dtype sets the precision"),
-        (config.eval.recording, "eval.recording=true", "rollouts of a training are not recorded"),
-        (encoded, "dataset.image_transforms.enable=true", "images are encoded once, before training"),
-    ]
-    for present, setting, why in refused:
-        if present:
-            raise MemobenchError(f"{setting} has no effect on policy={policy.type} ({why}); leave it out")
+    for is_set, setting, why in (
+        (config.dataset.streaming, "dataset.streaming", "memory needs all frames of an episode"),
+        (policy.use_amp, "policy.use_amp", "policy.dtype sets the precision"),
+        (config.eval.recording, "eval.recording", "rollouts of a training are not recorded"),
+        (encoded, "dataset.image_transforms.enable", "images are encoded once, before training"),
+    ):
+        if is_set:
+            raise MemobenchError(f"{setting}=true has no effect on policy={policy.type} ({why}); leave it out")
 
 
 def changes(name: str, value: object, default: object) -> Iterator[tuple[str, object]]:
@@ -311,32 +301,19 @@ def check_dataset(requested: CommandSettings) -> None:
     check_fetched(folder)
 
 
-def check_memory_settings(requested: CommandSettings, policy: Any) -> None:
-    """Refuse settings on the command line that belong to another memory; a checkpoint's may."""
-    from lerobot_memobench.policies.memobench_mem.memory import NONE, mechanism_settings
-
-    settings = requested.words.get("policy.memory_settings")
-    if settings and getattr(policy, "memory", NONE) != NONE:
-        mechanism_settings(policy.memory, value_of("policy.memory_settings", dict[str, Any], settings))
-
-
 # -- resumed trainings -------------------------------------------------------------------------------------------------
 
 
 def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
     """Return the words of LeRobot to resume a training, if ``output_dir=<run> resume=true`` is given.
 
-    LeRobot needs the path of the configuration in the run's last checkpoint. That holds all settings of the run;
-    settings on the command line override it.
-
-    Raises:
-        MemobenchError: there is no checkpoint, a recipe is named, or another policy than that of the run.
+    LeRobot needs the path of the configuration in the run's last checkpoint. It holds all settings of the run; those
+    on the command line override it. A recipe, or another policy than that of the run, is refused.
     """
     if not value_of("resume", bool, words.get("resume", "false")):
         return dict(words)
     stated = words.get(CONFIG_FILE)
-    is_recipe = RECIPE in words or (stated and Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG)
-    if is_recipe:
+    if RECIPE in words or (stated and Path(stated).is_file() and Path(stated).name != TRAIN_CONFIG):
         key = RECIPE if RECIPE in words else CONFIG_FILE
         raise MemobenchError(
             f"{key}={words[key]} cannot be combined with resume=true, which uses the configuration in the last "
@@ -355,10 +332,7 @@ def with_last_checkpoint(words: Mapping[str, str]) -> dict[str, str]:
         kind = checkpoint_type(str(source))
     if kind is not None and begun is not None and "/" not in kind and kind != begun:
         raise MemobenchError(f"the training in {folder} has policy={begun}; found policy={policy}; leave policy out")
-    return {
-        CONFIG_FILE: str(checkpoint / TRAIN_CONFIG),
-        **without(words, "policy", f"policy.{PATH}", f"policy.{TYPE}"),
-    }
+    return {CONFIG_FILE: str(checkpoint / TRAIN_CONFIG)} | without(words, "policy", f"policy.{PATH}", f"policy.{TYPE}")
 
 
 def last_checkpoint(run: Path) -> Path:
@@ -403,58 +377,46 @@ def check_same_training(
     requested: CommandSettings, config: TrainPipelineConfig, checkpoint: Path, notify: Callable[[str], None]
 ) -> None:
     """Refuse to resume a training with another dataset, or with settings that it cannot change; note the others."""
-    begun, model = requested.begun, checkpoint / "pretrained_model"
+    begun, model, dataset = requested.begun, checkpoint / "pretrained_model", config.dataset
     another = f"train a new run from the checkpoint: policy={model} output_dir=<new folder>"
     check_processors(model)
-    _check_same_dataset(config.dataset, begun.dataset, another)
+    old, new = (Path(root).expanduser().resolve() if root else None for root in (begun.dataset.root, dataset.root))
+    if old != new or (old is None and dataset.repo_id != begun.dataset.repo_id):
+        before = begun.dataset.root or begun.dataset.repo_id
+        moved = old is not None and not old.exists()
+        raise MemobenchError(
+            f"this training was begun on the dataset {before}; found {dataset.root or dataset.repo_id}; "
+            + (f"if it is the same dataset, move it or link it to {before}; else " if moved else "")
+            + f"leave it out, or {another}"
+        )
     changed = []
-    for name in requested.words:
+    for name in ("dataset.episodes", "dataset.revision", *requested.words):
         try:
             value, before = (attrgetter(name)(source) for source in (config, begun))
         except AttributeError:  # a setting of another type of optimizer
             continue
         if name in NOT_COMPARED or value == before:
             continue
-        if name.startswith(OF_OPTIMIZER):
+        if name.startswith(FIXED):
             raise MemobenchError(
-                f"this training was begun with {name}={before}, which its saved optimizer keeps; found {value}; leave "
+                f"this training was begun with {name}={before}, which it keeps; found {value}; leave "
                 f"{name.removeprefix('policy.')} out, or {another}"
             )
         if not name.startswith("policy."):  # see `check_as_begun`
             changed.append(f"{name}={value} instead of {before}")
     if config.policy is not None and begun.policy is not None:
         check_as_begun(model, config.policy, begun.policy)
-    done = step_reached(checkpoint)
-    if done < config.steps:
+    if (done := step_reached(checkpoint)) < config.steps:
         if changed:
             notify(f"note: this training continues with {', '.join(changed)}")
         if note := note_on_schedule(begun, config.steps, done):
             notify(note)
 
 
-def _check_same_dataset(dataset: Any, begun: Any, another: str) -> None:
-    """Refuse another dataset, other episodes or another revision than a training was begun with."""
-    roots = [Path(source.root).expanduser().resolve() if source.root else None for source in (dataset, begun)]
-    if roots[0] != roots[1] or (roots[0] is None and dataset.repo_id != begun.repo_id):
-        before = begun.root or begun.repo_id
-        moved = begun.root is not None and not Path(before).expanduser().exists()
-        raise MemobenchError(
-            f"this training was begun on the dataset {before}; found {dataset.root or dataset.repo_id}; "
-            + (f"if it is the same dataset, move it or link it to {before}; else " if moved else "")
-            + f"leave it out, or {another}"
-        )
-    for name in ("episodes", "revision"):
-        value, before = getattr(dataset, name), getattr(begun, name)
-        if value != before:
-            raise MemobenchError(
-                f"this training was begun with dataset.{name}={before}; found {value}; leave it out, or {another}"
-            )
-
-
 def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str | None:
-    """Return a note if another number of steps makes the learning rate of a resumed training jump at the step reached.
+    """Return a note if another number of steps makes the learning rate of a resumed training jump.
 
-    LeRobot builds the schedule for the new number and continues in it at that step.
+    LeRobot builds the schedule for the new number and continues in it at the step reached.
     """
     from torch import nn, optim
 
@@ -476,8 +438,8 @@ def note_on_schedule(begun: TrainPipelineConfig, steps: int, done: int) -> str |
 def resume_hint(config: TrainPipelineConfig, words: Mapping[str, str]) -> str:
     """Return the advice for a training that was terminated: the command that resumes from its last checkpoint."""
     assert config.output_dir is not None
-    if not any(complete_checkpoints(config.output_dir)):
-        return f"no checkpoint was saved; start again with: {shlex.join(['lerobot', 'train', *as_command_line(words)])}"
-    options = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
-    again = as_command_line({"output_dir": str(config.output_dir), "resume": "true", **options})
-    return f"go on with: {shlex.join(['lerobot', 'train', *again])}"
+    advice = "no checkpoint was saved; start again with"
+    if any(complete_checkpoints(config.output_dir)):
+        options = {key: value for key, value in words.items() if key in TRAINING_OPTIONS}  # LeRobot does not keep these
+        advice, words = "go on with", {"output_dir": str(config.output_dir), "resume": "true", **options}
+    return f"{advice}: {shlex.join(['lerobot', 'train', *as_command_line(words)])}"

@@ -83,14 +83,9 @@ STD_OFFSET = 0.01
 
 @dataclass
 class Training:
-    """A policy and its training data.
+    """A policy, its pre- and postprocessor, the episodes to train on and to hold out, and the lookup of all frames."""
 
-    Attributes:
-        policy: possibly with adapters. processors: pre- and postprocessor. dataset: the episodes to train on.
-        lookup: all frames of the dataset. seed: of augmentations.
-    """
-
-    policy: Any
+    policy: Any  # possibly with adapters
     processors: tuple[Any, Any]
     dataset: LeRobotDataset
     held_out: LeRobotDataset | None
@@ -133,19 +128,14 @@ def open_datasets(config: TrainPipelineConfig) -> tuple[LeRobotDataset, LeRobotD
 
 
 def open_metadata(config: DatasetConfig) -> LeRobotDatasetMetadata:
-    """Return the metadata of a training's dataset.
-
-    Raises:
-        MemobenchError: another version of this package wrote the dataset, or the dataset lacks an episode. LeRobot
-            ignores a missing episode and fails if none is left.
-    """
+    """Return the metadata of a training's dataset; refuse one of another version, and episodes that it lacks."""
     if config.root is not None:
         config.root = str(without_pattern(Path(config.root)))
     meta = LeRobotDatasetMetadata(config.repo_id, root=config.root, revision=config.revision)
     if EPISODE_INFO in meta.features:
         list_episodes(Path(meta.root))  # reads all records
     absent = [episode for episode in config.episodes or () if episode >= meta.total_episodes]
-    if absent or config.episodes == []:
+    if absent or config.episodes == []:  # LeRobot ignores them, and fails if none is left
         raise MemobenchError(
             f"found episodes={absent or config.episodes}, and the dataset {meta.root} has "
             f"{count_of(meta.total_episodes, 'episode')}; choose from 0 to {meta.total_episodes - 1}, or leave "
@@ -156,13 +146,16 @@ def open_metadata(config: DatasetConfig) -> LeRobotDatasetMetadata:
 
 def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, config: Any) -> None:
     """Add missing statistics that a policy needs for normalisation to the dataset of LeRobot's ``DatasetConfig``."""
+    if missing := lacking(Path(meta.root), needed_by(policy, meta.features, config.use_imagenet_stats)):
+        complete(downloaded(config, meta), missing, logger.warning)
+
+
+def downloaded(config: DatasetConfig, meta: LeRobotDatasetMetadata) -> Path:
+    """Return the folder of a dataset with its data, of which the metadata may be here alone."""
     root = Path(meta.root)
-    missing = lacking(root, needed_by(policy, meta.features, config.use_imagenet_stats))
-    if not missing:
-        return
-    if not (root / "data").is_dir():
-        root = Path(LeRobotDataset(config.repo_id, root=config.root, revision=config.revision).root)
-    complete(root, missing, logger.warning)
+    if (root / "data").is_dir():
+        return root
+    return Path(LeRobotDataset(config.repo_id, root=config.root, revision=config.revision).root)
 
 
 def with_features(policy: Any, features: dict[str, Any]) -> Any:
@@ -211,13 +204,12 @@ def check_environment(config: TrainPipelineConfig, meta: Any, features: dict[str
 
 
 def open_lookup(
-    root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str] | None = None
+    root: Path, config: MemobenchMemConfig, encoder: ObservationEncoder, renamed: Mapping[str, str]
 ) -> FrameLookup:
     """Open the lookup of a dataset's frames; compute missing features of the policy's perception first."""
-    in_data = {known: name for name, known in (renamed or {}).items()}
+    in_data = {known: name for name, known in renamed.items()}
     columns: dict[str, Tensor] = {}
     encoded: dict[str, Encoded] = {}
-    remember: Remember | None = None
     if isinstance(encoder, ImageTowerEncoder):
         table = read_frame_table(root)
     else:
@@ -228,7 +220,7 @@ def open_lookup(
     if isinstance(encoder, ImageTowerEncoder | VisualTokenEncoder):
         memory, present = visual_features(root, config, encoder, in_data)
         encoded = {encoded_key(camera): features.of_frames for camera, features in present.items()}
-        remember = None if memory is None else memory.tokens
+        remember: Remember | None = None if memory is None else memory.tokens
     else:
         observed = {**columns, OBS_RAW_STATE: columns[OBS_STATE], OBS_PHASE: torch.from_numpy(table.phase)}
         if isinstance(encoder, DetectionEncoder):
@@ -237,24 +229,16 @@ def open_lookup(
             slots = stored.all_frames().sum(dim=1, dtype=torch.float32)
             observed[DETECTED], encoded[DETECTED] = slots, lambda indices: slots[indices]
 
-        def remember_objects(episode: int, slots: Sequence[int]) -> Tensor:
+        def remember(episode: int, slots: Sequence[int]) -> Tensor:
             first = int(table.episodes[episode])
             return encoder.remember(observed, [first + slot * config.memory_stride for slot in slots])
 
-        remember = remember_objects
     # Without an alignment no embedding of a text is used, so the cheapest encoder does.
     texts = make_text_encoder(
         "words" if config.align == NONE else str(config.text_encoder), config.dimensions.text_dim, str(config.device)
     )
-    return FrameLookup(
-        root,
-        table,
-        stride=config.memory_stride,
-        texts=texts,
-        remember=remember,
-        columns=columns,
-        encoded=encoded,
-    )
+    stride = config.memory_stride
+    return FrameLookup(root, table, stride=stride, texts=texts, remember=remember, columns=columns, encoded=encoded)
 
 
 # -- texts -------------------------------------------------------------------------------------------------------------
@@ -266,16 +250,12 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
         return
     table, level = read_frame_table(Path(meta.root)), config.subgoal_level
     levels = [name for name in LEVEL_COLUMNS if any(table.subgoals.get(name, []))]
+    lacks = f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}')"
     if config.align != NONE and level not in levels:
-        fix = (
-            f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
-            if levels
-            else "use --policy.align=none, or a dataset that has the subgoal of each frame there"
-        )
-        raise MemobenchError(
-            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), so "
-            f"--policy.align={config.align} has no text to align memory with; {fix}."
-        )
+        hint = "use --policy.align=none, or a dataset that has the subgoal of each frame there"
+        if levels:
+            hint = f"it has {' and '.join(levels)} subgoals: choose one with --policy.subgoal_level"
+        raise MemobenchError(f"{lacks}, so --policy.align={config.align} has no text to align memory with; {hint}.")
     if config.oracle_memory and not any(table.memory or []):
         raise MemobenchError(
             f"The dataset {meta.root} has no text in a column '{MEMORY_COLUMN}', which --policy.oracle_memory=true "
@@ -286,9 +266,8 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
     own = subgoals_of(table.subgoals.get(level, []), table.episodes, meta.episodes["tasks"])
     if not any(own.values()):
         raise MemobenchError(
-            f"The dataset {meta.root} has no {level} subgoals (no text in a column '{LEVEL_COLUMNS[level]}'), from "
-            "which this memory learns; name a dataset of `memobench generate`, another policy.subgoal_level, or "
-            "another policy.memory."
+            f"{lacks}, from which this memory learns; name a dataset of `memobench generate`, another "
+            "policy.subgoal_level, or another policy.memory."
         )
     config.subgoals = config.subgoals or own
     if new := sorted({*texts_of(own)} - {*texts_of(config.subgoals)}):
@@ -300,10 +279,7 @@ def set_subgoals(config: MemobenchMemConfig, meta: LeRobotDatasetMetadata) -> No
 
 
 def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> FrameTable:
-    """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals.
-
-    A single text to shuffle and an episode of an unknown task are refused.
-    """
+    """Return a dataset's frames with the texts of ``config.align_targets`` in place of the aligned subgoals."""
     level, texts = config.subgoal_level, table.subgoals.get(config.subgoal_level, [])
     if config.align == NONE or not any(texts):
         return table
@@ -317,10 +293,10 @@ def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> F
     elif config.align_targets == ANSWERS:
         texts = answers(texts, table.episodes)
     elif config.align_targets == PROGRESS:
-        records = [episode.record for episode in list_episodes(root)]
-        if None in records:
+        names = [episode.record.task_name for episode in list_episodes(root) if episode.record is not None]
+        if len(names) < table.num_episodes:
             raise MemobenchError(f"The dataset {root} cannot be aligned with align_targets={PROGRESS}: {STRANGER}.")
-        texts = progress(texts, table.episodes, [record.task_name for record in records if record is not None])
+        texts = progress(texts, table.episodes, names)
     return replace(table, subgoals={**table.subgoals, level: texts})
 
 
@@ -330,7 +306,7 @@ def with_targets(table: FrameTable, config: MemobenchMemConfig, root: Path) -> F
 class DecodedSamples(Dataset[dict[str, Any]]):
     """LeRobot's samples by their global indices, images included; actions of a chunk after a hold are padding.
 
-    With the number of a draw (`FrameSampler.numbered`) an augmentation depends on it and the seed alone.
+    An augmentation depends on the seed and the number of the draw (`FrameSampler.numbered`) alone.
     """
 
     def __init__(self, dataset: LeRobotDataset, lookup: FrameLookup, chunk: Sequence[int], seed: int) -> None:
@@ -357,20 +333,18 @@ def make_training_processors(
     stats = {**meta.stats, **execution_statistics(lookup)}
     if not policy.pretrained_path:
         return make_memobench_mem_pre_post_processors(policy, stats, meta, lookup)
-    statistics: dict[str, Any] = {} if config.resume else {"stats": stats}  # a resumed training keeps its statistics
-    normalized = {**statistics, "norm_map": policy.normalization_mapping}
-    before: dict[str, Any] = {
-        "device_processor": {"device": torch.device(policy.device).type},
-        "normalizer_processor": {**normalized, "features": {**policy.input_features, **policy.output_features}},
-        "rename_observations_processor": {"rename_map": config.rename_map},
-    }
-    after: dict[str, Any] = {"unnormalizer_processor": {**normalized, "features": policy.output_features}}
+    # A resumed training keeps the statistics of its checkpoint.
+    normalized = {"norm_map": policy.normalization_mapping} | ({} if config.resume else {"stats": stats})
     preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=policy,
         pretrained_path=policy.pretrained_path,
         pretrained_revision=policy.pretrained_revision,
-        preprocessor_overrides=before,
-        postprocessor_overrides=after,
+        preprocessor_overrides={
+            "device_processor": {"device": torch.device(policy.device).type},
+            "normalizer_processor": {**normalized, "features": {**policy.input_features, **policy.output_features}},
+            "rename_observations_processor": {"rename_map": config.rename_map},
+        },
+        postprocessor_overrides={"unnormalizer_processor": {**normalized, "features": policy.output_features}},
     )
     follow_training(preprocessor.steps, policy, meta, lookup)
     return preprocessor, postprocessor

@@ -1,9 +1,8 @@
 """Cache the outputs of frozen encoders for every frame of a dataset: one safetensors file per episode.
 
-A memory reads up to 32 earlier frames per sample, and a policy with a frozen encoder needs the tokens of its images
-at every update. They are computed once, before training, in ``feature_cache/<name>/`` in the dataset's folder. The name
-ends with a hash of frames, encoder weights, camera and stride, so other inputs have another cache. A file that exists
-is complete. With several processes, each one encodes a part of the episodes.
+A memory reads up to 32 earlier frames per sample, and a frozen encoder's tokens are needed at every update. They are
+computed once, in ``feature_cache/<name>/`` in the dataset's folder; the name ends with a hash of frames, encoder
+weights, camera and stride. A file that exists is complete. With several processes, each encodes a part of the episodes.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
 from lerobot_memobench.jobs.threads import cores
+from lerobot_memobench.perception.detector import load_detector, load_visual_encoder
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
-from lerobot_memobench.perception.weights import load_detector, load_visual_encoder
 from lerobot_memobench.policies.checkpoint import undamaged_tensors
 from lerobot_memobench.policies.memobench_mem.checkpoints import load_exactly, read_weights
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -60,21 +59,14 @@ MOST_THREADS = 8
 _SAMPLE = 1 << 16
 """Bytes of a video that are hashed at each of its start, middle and end."""
 _VISION_PREFIX = "paligemma_with_expert.paligemma.model."
-Progress = Callable[[int, int], None]
-"""Called as progress(completed episodes, all episodes)."""
 
 
 class Features(NamedTuple):
-    """An encoder of frames.
+    """An encoder of frames."""
 
-    Attributes:
-        key: identity of the encoder: weights and input size. size: numbers of a frame.
-        make: maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16.
-    """
-
-    key: str
-    size: int
-    make: Callable[..., Tensor]
+    key: str  # identity: weights and input size
+    size: int  # numbers of a frame
+    make: Callable[..., Tensor]  # maps images (N, 3, H, W) in [0, 1], or other input, to features (N, P, D) bfloat16
 
 
 class EpisodeFeatures:
@@ -130,28 +122,26 @@ def make_features(
     read: FrameReader | None = None,
     batch_size: int = 64,
     workers: int | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[int, int], None] | None = None,
     notify: Callable[[str], None] = logger.info,
 ) -> EpisodeFeatures:
     """Compute missing features, and open those of all episodes.
 
     Args:
         camera: image column to encode. stride: every ``stride``-th frame is stored.
-        read: source of frames; by default the camera's videos.
-        batch_size: frames per pass of the encoder.
+        read: source of frames; by default the camera's videos. batch_size: frames per pass of the encoder.
         workers: threads that decode videos ahead of the encoder; by default one per core, up to 8.
+        progress: called with the numbers of complete and of all episodes.
         notify: called with the folder and its size before anything is encoded.
-
-    Raises:
-        MemobenchError: the dataset lacks the camera, or the disk is full.
     """
     folder, table = features_folder(root, prefix, features, camera, stride), read_frame_table(root)
+    complete = EpisodeFeatures(folder, table.episodes, stride)
     progress = progress or functools.partial(logger.info, "feature cache: %d of %d episodes")
     counts = -(-np.diff(table.episodes) // stride)
     missing = [number for number in range(table.num_episodes) if not episode_file(folder, number).is_file()]
     progress(table.num_episodes - len(missing), table.num_episodes)
     if not missing:
-        return EpisodeFeatures(folder, table.episodes, stride)
+        return complete
     read = read or frame_reader(root, camera)
     needed, free = int(counts[missing].sum()) * features.size * torch.bfloat16.itemsize, free_bytes(folder)
     notify(f"The feature cache {folder} needs {in_words(needed)}; {in_words(free)} are free.")
@@ -164,7 +154,10 @@ def make_features(
     rank, world = rank_of_world()
     with explaining_disk_errors(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
         folder.mkdir(parents=True, exist_ok=True)
-        _keep_from_the_hub(root)
+        ignored, line = root / ".gitignore", f"/{FOLDER}/"  # which uploads to the hub follow
+        lines = ignored.read_text(encoding="utf-8").splitlines() if ignored.is_file() else []
+        if line not in lines:
+            write_file(ignored, "\n".join([*lines, line]) + "\n")
         for number in [number for number in missing if number % world == rank]:
             frames = [slot * stride for slot in range(counts[number])]
             parts = [frames[first : first + batch_size] for first in range(0, len(frames), batch_size)]
@@ -174,15 +167,7 @@ def make_features(
             progress(sum(episode_file(folder, k).is_file() for k in range(table.num_episodes)), table.num_episodes)
     while not all(episode_file(folder, number).is_file() for number in missing):  # other processes encode these
         time.sleep(1)
-    return EpisodeFeatures(folder, table.episodes, stride)
-
-
-def _keep_from_the_hub(root: Path) -> None:
-    """Exclude caches from uploads of the dataset's folder by its ``.gitignore``, which the hub's client follows."""
-    path, line = root / ".gitignore", f"/{FOLDER}/"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    if line not in lines:
-        write_file(path, "\n".join([*lines, line]) + "\n")
+    return complete
 
 
 def dataset_fingerprint(root: Path, camera: str) -> str:
@@ -218,11 +203,7 @@ def visual_features(
 ) -> tuple[EpisodeFeatures | None, dict[str, EpisodeFeatures]]:
     """Make the features of the memory, None without one, and a visual encoder's tokens of present images.
 
-    Pooled tokens are computed from the present ones, so that no video is decoded twice.
-
-    Args:
-        in_data: the policy's name of a camera -> the dataset's, where they differ. The present ones have the policy's.
-        how: of `make_features`.
+    ``in_data``: the policy's name of a camera -> the dataset's, where they differ. The present ones have the policy's.
     """
     cameras, remembered, stride = cameras_of(read_info(root)["features"]), encoder.memory_input, config.memory_stride
     present: dict[str, EpisodeFeatures] = {}
@@ -238,6 +219,7 @@ def visual_features(
     if config.remembers_thumbnails:
         kind, features = "thumbnails", Features(THUMBNAILS, THUMBNAIL**2, thumbnails)
     elif isinstance(encoder, VisualTokenEncoder):
+        # From the present tokens, so that no video is decoded twice.
         features, read = Features(encoder.key, POOLED**2 * WIDTH, encoder.pooled), present[remembered].tokens
     else:
         features = Features(encoder.key, encoder.tokens_per_frame * encoder.dim, encoder)
@@ -252,9 +234,7 @@ def detected_slots(
     """Make a detector's object slots for every frame.
 
     Each number is stored as two bfloat16 numbers, its rounded value and the rest; one alone has errors of 4 mm.
-
-    Args:
-        cameras: the policy's name of each camera -> the dataset's. state: the dataset's name of the state.
+    ``cameras``: the policy's name of each camera -> the dataset's; ``state``: the dataset's name of the state.
     """
     if convention_of(read_info(root)["features"]) == MIRRORED:
         raise MemobenchError(f"{root} has images of convention={MIRRORED}, and a detector reads {UPRIGHT} ones")
@@ -281,9 +261,8 @@ def detected_slots(
 def load_image_tower(config: MemobenchMemConfig, weights: str | Path | None = None) -> ImageTowerEncoder:
     """Load the frozen image tower of ``config``'s size, without the rest of the model.
 
-    Args:
-        weights: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
-            random weights of a fixed seed.
+    ``weights``: folder or repository of a pi0.5 or memobench_mem checkpoint; None: ``config.base_weights``, or else
+    random weights of a fixed seed.
     """
     with torch.device("meta"):  # the language model's weights are never allocated
         model = make_backbone(config).paligemma.model
@@ -306,23 +285,16 @@ def load_token_encoder(config: MemobenchMemConfig, weights: str | Path | None = 
         assert config.visual_encoder is not None  # the configuration has one
         tower = load_visual_encoder(config.visual_encoder)
     else:
-        tower = VisualEncoder(folded=True).eval()
+        tower = VisualEncoder().fold().eval()
         load_exactly(tower, read_weights(source, _VISION_PREFIX + "vision_tower."), source, optional=set())
     width = config.dimensions.vlm.width
     return VisualTokenEncoder(tower.to(config.device), [*config.image_features], config.memory_camera or "", width)
 
 
 def cache_dataset(root: Path, config: MemobenchMemConfig, *, weights: str | Path | None = None, **how: Any) -> Path:
-    """Make or complete the features of a dataset for a policy, for example ``MemobenchMemConfig(size="tiny")``.
+    """Make or complete the features of a dataset for a policy; return their folder, with a visual encoder the memory's.
 
-    Args:
-        weights: of `load_image_tower`. how: of `make_features`.
-
-    Returns:
-        Their folder, ``<root>/feature_cache/<prefix>-<hash>``; with a visual encoder the memory's folder.
-
-    Raises:
-        MemobenchError: the dataset lacks a camera, the disk has no room, or the policy needs no cache.
+    ``weights`` is of `load_image_tower`, ``how`` of `make_features`. A policy that needs no cache is refused.
     """
     config.memory_camera = config.memory_camera or next(iter(cameras_of(read_info(root)["features"])), None)
     if config.detector is not None:

@@ -1,7 +1,7 @@
 """Train ``policy=memobench_mem``: datasets, policy, processors, updates, checkpoints.
 
-The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them; ``training_weights.safetensors``
-holds the raw weights, the model file their moving average. A resumed training continues bit for bit.
+The checkpoints are LeRobot's, so that LeRobot and `lerobot eval` load them: the model file holds the moving average of
+the weights, ``training_weights.safetensors`` the weights. A resumed training continues bit for bit.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import ctypes
 import logging
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from inspect import signature
@@ -41,16 +41,20 @@ from lerobot.utils.io_utils import write_json
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import save_rng_state, set_seed
 from lerobot.utils.utils import cycle, init_logging, inside_slurm
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
 from torch.utils.data import DataLoader, Subset
 
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.checkpoint import read_checkpoint_json
-from lerobot_memobench.training.average import WeightAverage, begin_average
+from lerobot_memobench.policies.checkpoint import as_trained, checkpoint_file, read_checkpoint_json, undamaged_tensors
+from lerobot_memobench.policies.memobench_mem.checkpoints import read_tensors, restarted
 from lerobot_memobench.training.data import Training, check_environment, open_datasets, open_training
 from lerobot_memobench.training.sampler import FrameSampler, seed_of, task_weights
 
 logger = logging.getLogger(__name__)
 
+TRAINING_FILE = "training_weights.safetensors"
 LOSSES = "losses.csv"
 """File of the run's folder: numbers of every ``log_freq`` updates, and of every evaluation."""
 DISTRIBUTED = (DistributedType.NO, DistributedType.MULTI_CPU, DistributedType.MULTI_GPU)
@@ -73,7 +77,6 @@ def train(config: TrainPipelineConfig) -> None:
         progress = load_state(config.checkpoint_path, optimizer, scheduler)
         step, batch_size = progress["step"], progress.get("batch_size") or config.batch_size
         sampler.resume_from(step, batch_size, progress.get("num_processes") or accelerator.num_processes)
-
     loader = make_loader(config, training, training.samples(), sampler=sampler)
     held_out_loader = None if training.held_out is None else make_held_out_loader(config, training)
     model, optimizer, loader, scheduler, held_out_loader = accelerator.prepare(
@@ -154,10 +157,9 @@ class TrainingState:
 
     def preprocessed(self, batch: dict[str, Any]) -> dict[str, Any]:
         """Return the model's inputs of a batch of samples."""
-        images = [
-            key for key in self.training.dataset.meta.camera_keys if key in batch and batch[key].dtype == torch.uint8
-        ]
-        batch |= {key: batch[key].to(torch.float32) / 255.0 for key in images}
+        for key in self.training.dataset.meta.camera_keys:
+            if key in batch and batch[key].dtype == torch.uint8:
+                batch[key] = batch[key].to(torch.float32) / 255.0
         inputs: dict[str, Any] = self.training.processors[0](batch)
         return inputs
 
@@ -264,6 +266,100 @@ class TrainingState:
             processor.push_to_hub(self.training.policy.config.repo_id)
 
 
+# -- average of the weights --------------------------------------------------------------------------------------------
+
+
+class WeightAverage:
+    """Moving average of trained weights: parameters, averages and numbers of updates by the parameter's name.
+
+    It is kept outside the module, so that optimizer, DDP and ``state_dict`` do not see it; torch's ``AveragedModel`` is
+    a copy of the module with one number of updates for all parameters. The decay grows to the given value as
+    (1 + n) / (10 + n) over the first updates n of a parameter, so that the average of a short run is not dominated by
+    the initial weights. Averages are float32, because bfloat16 cannot hold steps of a thousandth.
+    """
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
+        self.decay, self.parameters = decay, dict(parameters)
+        self.counts = dict.fromkeys(self.parameters, 0)
+        self.average = {name: weight.detach().to(torch.float32, copy=True) for name, weight in self.parameters.items()}
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Move the average towards the current weights by one step."""
+        for count in set(self.counts.values()):
+            names = [name for name, updates in self.counts.items() if updates == count]
+            decay = min(self.decay, (1 + count) / (10 + count))
+            weights = [self.parameters[name].detach().to(torch.float32) for name in names]
+            torch._foreach_lerp_([self.average[name] for name in names], weights, 1.0 - decay)
+        self.counts = {name: updates + 1 for name, updates in self.counts.items()}
+
+    @contextmanager
+    def applied(self, dtypes: Mapping[nn.Parameter, torch.dtype] | None = None) -> Iterator[None]:
+        """Set the parameters to the average inside the block, some in other ``dtypes``; float32 ones are not copied."""
+        trained = {name: parameter.data for name, parameter in self.parameters.items()}
+        try:
+            for name, parameter in self.parameters.items():
+                parameter.data = self.average[name].to((dtypes or {}).get(parameter, parameter.dtype))
+            yield
+        finally:
+            for name, parameter in self.parameters.items():
+                parameter.data = trained[name]
+
+    def save(self, folder: Path) -> None:
+        """Write the trained weights, and the averages that the precision of the model's file would round."""
+        tensors = {f"weights.{name}": parameter.detach().contiguous() for name, parameter in self.parameters.items()}
+        for name, parameter in self.parameters.items():
+            if parameter.dtype != torch.float32:
+                tensors[f"average.{name}"] = self.average[name]
+        longest = max(self.counts.values(), default=0)
+        other_counts = {f"updates.{name}": str(count) for name, count in self.counts.items() if count != longest}
+        folder.mkdir(parents=True, exist_ok=True)
+        save_file(tensors, folder / TRAINING_FILE, metadata={"updates": str(longest), **other_counts})
+
+    @torch.no_grad()
+    def restore(self, path: Path, names: Collection[str]) -> list[str]:
+        """Restore weights, averages and numbers of updates of these parameters in a module that holds the average.
+
+        Return the parameters without a saved state, whose average starts at their present weights.
+        """
+        with undamaged_tensors(path), safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+        tensors: Mapping[str, Tensor] = read_tensors(path)
+        saved = {name: tensors[f"weights.{name}"] for name in names if f"weights.{name}" in tensors}
+        for name, weights in saved.items():
+            parameter = self.parameters[name]
+            if weights.shape != parameter.shape:
+                raise MemobenchError(
+                    f"{path} holds '{name}' in another shape than this policy; copy the checkpoint again"
+                )
+            average = tensors.get(f"average.{name}", parameter.detach())  # else the model's file holds it exactly
+            self.average[name] = average.to(parameter.device, torch.float32, copy=True)
+            self.counts[name] = int(metadata.get(f"updates.{name}", metadata["updates"]))
+            parameter.copy_(weights.to(parameter.device))
+        return [name for name in self.parameters if name not in saved]
+
+
+def begin_average(policy: Any) -> WeightAverage | None:
+    """Return the average of a policy in training; None without one (``ema_decay=0``, adapters).
+
+    A policy loaded from a checkpoint holds the average. Its trained weights are restored, and the average continues;
+    it starts again for parts that are initialised again, or that the checkpoint did not train.
+    """
+    config = policy.config
+    if not config.ema_decay or config.use_peft:
+        return None
+    average = WeightAverage(policy.trained_parameters(), config.ema_decay)
+    source, revision = config.pretrained_path, config.pretrained_revision
+    path = None if source is None else checkpoint_file(source, TRAINING_FILE, revision)
+    if path is None:
+        return average
+    trained: Any = as_trained(source, config, revision)
+    new = average.restore(path, average.parameters.keys() - restarted(policy, trained))
+    if new:
+        logger.info("the average continues from '%s'; that of %s starts again", source, ", ".join(new))
+    return average
+
+
 # -- batches -----------------------------------------------------------------------------------------------------------
 
 
@@ -307,10 +403,7 @@ def make_loader(
 
 
 def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> DataLoader[Any]:
-    """Return batches of the frames to learn from of held-out episodes.
-
-    There are at most ``max_eval_samples``, at equal distances in the episodes of each task.
-    """
+    """Return batches of ``max_eval_samples`` frames of held-out episodes, at equal distances in those of each task."""
     dataset, lookup = training.held_out, training.lookup
     assert dataset is not None
     frames = FrameSampler(lookup.episodes, lookup.acts, dataset.episodes).frames.tolist()
@@ -334,8 +427,7 @@ def make_held_out_loader(config: TrainPipelineConfig, training: Training) -> Dat
 def save_state(checkpoint: Path, progress: dict[str, int], optimizer: Any, scheduler: Any) -> None:
     """Write ``training_state`` of a checkpoint, the optimizer's parameter groups last.
 
-    Args:
-        progress: ``step`` and, per update, ``batch_size`` of a process and ``num_processes``.
+    ``progress``: ``step`` and, per update, ``batch_size`` of a process and ``num_processes``.
     """
     folder = checkpoint / TRAINING_STATE_DIR
     folder.mkdir(parents=True, exist_ok=True)
@@ -347,10 +439,7 @@ def save_state(checkpoint: Path, progress: dict[str, int], optimizer: Any, sched
 
 
 def load_state(checkpoint: Path, optimizer: Any, scheduler: Any) -> dict[str, int]:
-    """Restore optimizer and schedule of a checkpoint; return its ``progress``.
-
-    The random state is not restored: each update sets its own (`train`).
-    """
+    """Restore optimizer and schedule of a checkpoint, not the random state; return its ``progress``."""
     folder = checkpoint / TRAINING_STATE_DIR
     progress = read_checkpoint_json(folder / TRAINING_STEP)
     load_optimizer_state(optimizer, folder)
@@ -365,8 +454,7 @@ def load_state(checkpoint: Path, optimizer: Any, scheduler: Any) -> dict[str, in
 class TrainingLog:
     """Log a training: LeRobot's console lines, W&B if it is enabled, and a CSV file in the run's folder.
 
-    Attributes:
-        numbers: LeRobot's tracker: means since the last line.
+    ``numbers`` is LeRobot's tracker of the means since the last line.
     """
 
     def __init__(
@@ -386,15 +474,9 @@ class TrainingLog:
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f", reduction="max")
         processes = {"accelerator": accelerator, "dp_world_size": accelerator.num_processes}  # LeRobot 0.6, its main
-        known = signature(MetricsTracker).parameters
-        self.numbers = MetricsTracker(
-            config.batch_size,
-            dataset.num_frames,
-            dataset.num_episodes,
-            meters,
-            step,
-            **{name: value for name, value in processes.items() if name in known},
-        )
+        known = {name: processes[name] for name in processes if name in signature(MetricsTracker).parameters}
+        frames, episodes = dataset.num_frames, dataset.num_episodes
+        self.numbers = MetricsTracker(config.batch_size, frames, episodes, meters, step, **known)
         self._wandb = None
         if self._first and config.wandb.enable and config.wandb.project:
             from lerobot.common.wandb_utils import WandBLogger
@@ -406,8 +488,13 @@ class TrainingLog:
         )
         if self._first:
             logger.info("Output dir: %s", config.output_dir)
-            logger.info("%d frames of %d episodes", dataset.num_frames, dataset.num_episodes)
-            self._keep_until(step)
+            logger.info("%d frames of %d episodes", frames, episodes)
+            rows = [["step", "mode", "name", "value"]]
+            if self._file.is_file():  # of a resumed training, which writes the later rows again
+                with self._file.open(encoding="utf-8", newline="") as before:
+                    rows += [row for row in csv.reader(before) if row[0].isdecimal() and int(row[0]) <= step]
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            self._write_rows(rows, "w")
 
     def note(self, logged: Mapping[str, Any]) -> None:
         """Add the numbers of an update."""
@@ -461,27 +548,14 @@ class TrainingLog:
     def _send(self, step: int, numbers: dict[str, Any], mode: str) -> None:
         if self._wandb is not None:
             self._wandb.log_dict(numbers, step, mode=mode)
-        rows = [(step, mode, name, value) for name, value in numbers.items() if isinstance(value, int | float)]
-        with self._file.open("a", encoding="utf-8", newline="") as file:
-            csv.writer(file).writerows(rows)
+        self._write_rows([(step, mode, name, n) for name, n in numbers.items() if isinstance(n, int | float)], "a")
 
-    def _keep_until(self, step: int) -> None:
-        """Remove the rows after the step of a resumed training; create the file if it does not exist."""
-        rows = [["step", "mode", "name", "value"]]
-        if self._file.is_file():
-            with self._file.open(encoding="utf-8", newline="") as before:
-                rows += [row for row in csv.reader(before) if row[0].isdecimal() and int(row[0]) <= step]
-        self._file.parent.mkdir(parents=True, exist_ok=True)
-        with self._file.open("w", encoding="utf-8", newline="") as file:
+    def _write_rows(self, rows: Iterable[Iterable[Any]], how: str) -> None:
+        with self._file.open(how, encoding="utf-8", newline="") as file:
             csv.writer(file).writerows(rows)
 
 
 # -- memory on a CPU ---------------------------------------------------------------------------------------------------
-
-
-_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of glibc's malloc.h
-_LARGEST = 32 << 20
-"""The largest threshold of mapped blocks that glibc allows, bytes."""
 
 
 def keep_freed_memory() -> None:
@@ -492,5 +566,7 @@ def keep_freed_memory() -> None:
     if platform.libc_ver()[0] != "glibc":
         return
     libc = ctypes.CDLL(None)
-    for parameter, value in ((_MMAP_THRESHOLD, _LARGEST), (_TRIM_THRESHOLD, 2**31 - 1), (_TOP_PAD, 8 * _LARGEST)):
+    trim_threshold, top_pad, mmap_threshold = -1, -2, -3  # of glibc's malloc.h
+    largest = 32 << 20  # bytes: the largest threshold of mapped blocks that glibc allows
+    for parameter, value in ((mmap_threshold, largest), (trim_threshold, 2**31 - 1), (top_pad, 8 * largest)):
         libc.mallopt(parameter, value)

@@ -26,8 +26,7 @@ class FrameSampler:
 
     Args:
         episodes: (E + 1,) first frame of each episode, and N. acts: (N,) whether a frame is one to learn from.
-        used: the episodes to draw; None: all.
-        together: frames of an episode in a row.
+        used: the episodes to draw; None: all. together: frames of an episode in a row.
         tasks: result of `task_weights`; None: each frame is drawn once per epoch.
         numbered: whether it yields pairs of a frame and its number among all draws.
     """
@@ -128,12 +127,8 @@ def task_weights(
     is a task.
 
     Args:
-        meta: the dataset's metadata. episodes: (E + 1,) first frame of each episode, and N.
-        phase: (N,) 0 in the prompt.
+        episodes: (E + 1,) first frame of each episode, and N. phase: (N,) 0 in the prompt.
         weights: by task name, memory type or ``prompted``; the first match in this order counts, the default is 1.
-
-    Raises:
-        MemobenchError: the dataset lacks a name, or all weights are 0.
     """
     records = [episode.record for episode in list_episodes(Path(meta.root))]
     texts = (" / ".join(tasks) for tasks in meta.episodes["tasks"])
@@ -141,10 +136,8 @@ def task_weights(
     tasks, numbers = np.unique(names, return_inverse=True)
     types = {name: record.memory_type for name, record in zip(names, records, strict=True) if record is not None}
     prompted = np.bincount(np.repeat(numbers, np.diff(episodes)), phase == PROMPT) > 0
-    keys = [
-        (str(name), types.get(str(name), ""), PROMPTED * bool(begins))
-        for name, begins in zip(tasks, prompted, strict=True)
-    ]
+    with_prompt = [PROMPTED if begins else "" for begins in prompted]
+    keys = [(name, types.get(name, ""), word) for name, word in zip(tasks.tolist(), with_prompt, strict=True)]
     known = sorted({key for row in keys for key in row if key} | {PROMPTED})
     for name in weights:
         if name not in known:

@@ -1,6 +1,6 @@
 """Load the weights of a checkpoint, and check that its processor steps agree with the configuration.
 
-The model file holds the averaged weights; `training.average` saves the trained weights next to it.
+The model file holds the averaged weights; `training.loop` saves the trained weights next to it.
 """
 
 from __future__ import annotations
@@ -58,17 +58,14 @@ def has_another_memory(config: MemobenchMemConfig, trained: MemobenchMemConfig) 
 def restarted(policy: nn.Module, trained: MemobenchMemConfig) -> set[str]:
     """Return the names of the policy's tensors that keep their initial weights instead of a checkpoint's.
 
-    These are the memory and its fusion if the memory differs, and the alignment head if the memory, the objective or
-    the text encoder differs. ``trained`` is the checkpoint's configuration.
+    These are the memory and its fusion if the memory differs from that of ``trained``, the checkpoint's configuration,
+    and the alignment head if the memory, the objective or the text encoder differs.
     """
     config, model = cast(MemobenchMemConfig, policy.config), cast(MemoryPI05, policy.model)
+    head = {name for name in policy.state_dict() if name.startswith("alignment.")}
     if has_another_memory(config, trained):
-        return _head(policy) | {f"model.{name}" for name in model.memory_names()}
-    return set() if (config.align, config.text_encoder) == (trained.align, trained.text_encoder) else _head(policy)
-
-
-def _head(policy: nn.Module) -> set[str]:
-    return {name for name in policy.state_dict() if name.startswith("alignment.")}
+        return head | {f"model.{name}" for name in model.memory_names()}
+    return set() if (config.align, config.text_encoder) == (trained.align, trained.text_encoder) else head
 
 
 def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: MemobenchMemConfig) -> None:
@@ -87,7 +84,7 @@ def load_weights(policy: nn.Module, path: Path, source: str | Path, trained: Mem
             trained.memory,
             config.memory,
             "" if config.memory != trained.memory else " with other settings",
-            len(new - _head(policy)),
+            sum(not name.startswith("alignment.") for name in new),
             config.memory_stride,
         )
     weights = {name: tensor for name, tensor in read_tensors(path).items() if name not in new}
@@ -109,7 +106,7 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
 
 
 def weights_file(source: str | Path, revision: str | None = None) -> Path:
-    """Return the file of a checkpoint's weights; a `MemobenchError` without one."""
+    """Return the file of a checkpoint's weights, or raise `MemobenchError`."""
     path = checkpoint_file(source, WEIGHTS_FILE, revision)
     if path is None:
         raise MemobenchError(f"The checkpoint '{source}' has no {WEIGHTS_FILE}; give a pretrained_model folder.")
@@ -126,12 +123,12 @@ def read_weights(source: str | Path, prefix: str = "") -> dict[str, Tensor]:
     """Return the weights whose names start with ``prefix``, without a leading ``model.`` and the prefix."""
     path = weights_file(source)
     with undamaged_tensors(path), safe_open(path, framework="pt") as tensors:
-        weights = {}
-        for name in tensors.keys():  # noqa: SIM118 (not a dict)
-            short = name.removeprefix("model.")
-            if short.startswith(prefix):
-                weights[short.removeprefix(prefix)] = tensors.get_tensor(name)
-    return weights
+        names = {name.removeprefix("model."): name for name in tensors.keys()}  # noqa: SIM118 (not a dict)
+        return {
+            short.removeprefix(prefix): tensors.get_tensor(name)
+            for short, name in names.items()
+            if short.startswith(prefix)
+        }
 
 
 def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Path, optional: set[str]) -> None:
@@ -155,11 +152,10 @@ def load_exactly(module: nn.Module, weights: dict[str, Tensor], source: str | Pa
 def require_agreement(source: str | Path, revision: str | None, config: MemobenchMemConfig, *, training: bool) -> None:
     """Raise `MemobenchError` if the saved processor steps of a checkpoint disagree with ``config``.
 
-    Training updates most steps (`follow_training`); a pretrained tokenizer keeps the checkpoint's settings. A
-    checkpoint without a preprocessor passes this check; LeRobot reports it.
+    Training updates most steps (`follow_training`); a pretrained tokenizer keeps the checkpoint's settings.
     """
     path = checkpoint_file(source, PREPROCESSOR_FILE, revision)
-    if path is None:
+    if path is None:  # LeRobot reports it
         return
     steps: dict[str, Any] = {step.get("registry_name", ""): step.get("config", {}) for step in processor_steps(path)}
     tokenizer, saved = steps.get("memobench_tokenizer"), dict[str, Any]()

@@ -21,8 +21,8 @@ from lerobot_memobench.datasets.layout import PRIVILEGED
 from lerobot_memobench.envs.observations import DETECTIONS, PIXEL_INPUT
 from lerobot_memobench.envs.observations import PRIVILEGED as PRIVILEGED_INPUT
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.perception.detector import PACKAGE
 from lerobot_memobench.perception.visual_encoder import SIDE
-from lerobot_memobench.perception.weights import PACKAGE
 from lerobot_memobench.policies.memobench_mem.memory import (
     NONE,
     OURS,
@@ -32,7 +32,7 @@ from lerobot_memobench.policies.memobench_mem.memory import (
     setting_names,
     settings_of_another,
 )
-from lerobot_memobench.policies.memobench_mem.memory.mechanism import MEMORY_GRID
+from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
 from lerobot_memobench.policies.memobench_mem.sizes import FLOW_MATCHING, REGRESSION, SIZES, Dimensions
 
 logger = logging.getLogger(__name__)
@@ -46,8 +46,6 @@ PERCEPTIONS = ("pixels", "objects")
 SUBGOAL_LEVELS = ("coarse", "intermediate", "fine")
 PROMPTED = "prompted"
 """Key of ``task_weights`` for tasks that begin with a demonstration prompt."""
-TOKENS_PER_FRAME = {"pixels": MEMORY_GRID**2, "objects": 2}
-"""Memory tokens of a remembered frame."""
 MEMORY_STRIDE, FRAMES_PER_EPISODE = 8, 6
 """Defaults if training decodes no video; 1 otherwise."""
 ORACLE_TOKENS = 128
@@ -78,10 +76,7 @@ IMAGES = Condition("a policy that sees images", lambda config: config.uses_image
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda config: config.uses_visual_encoder)
 STATE_TOKEN = Condition("a policy whose state is a token", lambda config: config.state_token)
 MEMORY = Condition("a memory", lambda config: config.memory != NONE)
-OBJECT_MEMORY = Condition(
-    "a memory of objects other than motion",
-    lambda config: config.uses_objects and config.memory != NONE and not find_mechanism(config.memory).asks_motion,
-)
+OBJECT_MEMORY = Condition("a memory of objects other than motion", lambda config: config.skips_repeated_frames)
 TEXT_MEMORY = Condition("a memory that learns from texts", lambda config: config.privileged_memory)
 ALIGNMENT = Condition("an alignment", lambda config: config.align != NONE)
 TEXTS = Condition(
@@ -98,21 +93,10 @@ def policy_setting(
     least: float = -math.inf,
     most: float = math.inf,
 ) -> Any:
-    """Return a field of `MemobenchMemConfig`; without its condition ``used_if`` it has no effect.
-
-    The default may be ``dict``, for an empty one. No ``values`` stand for any value of the type.
-    """
+    """Return a field of `MemobenchMemConfig`, which has no effect without its condition ``used_if``."""
     metadata = {"used_if": used_if, "values": tuple(values), "least": least, "most": most}
-    kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}
+    kind: dict[str, Any] = {"default_factory": dict} if default is dict else {"default": default}  # dict: an empty one
     return field(**kind, metadata=metadata)
-
-
-class UnreadError(MemobenchError):
-    """A field without effect differs from its default; ``defaults`` maps all such fields to their defaults."""
-
-    def __init__(self, sentence: str, defaults: Mapping[str, Any]) -> None:
-        super().__init__(sentence)
-        self.defaults = defaults
 
 
 FROM_SIZE: Any = None
@@ -131,7 +115,6 @@ class FusedAdamWConfig(AdamWConfig):
     """
 
     def build(self, params: Iterable[nn.Parameter]) -> Optimizer:
-        """Return the optimizer of these parameters."""
         learning = list(params)
         fused = all(parameter.device.type in ("cpu", "cuda") for parameter in learning) or None  # None: torch's choice
         return AdamW(learning, self.lr, self.betas, self.eps, self.weight_decay, fused=fused)
@@ -150,7 +133,6 @@ class WarmupFractionSchedulerConfig(LRSchedulerConfig):
     final: float = 1.0
 
     def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        """Return the schedule of a training of ``num_training_steps`` updates."""
         steps = self.num_warmup_steps
         warmup = max(1, round(self.warmup_fraction * num_training_steps) if steps is None else steps)
 
@@ -340,26 +322,22 @@ class MemobenchMemConfig(PreTrainedConfig):
             "memory_camera": (f"{OBS_IMAGES}.{next(iter(CAMERAS))}",),
             "num_inference_steps": (1,),
         }
-        unread: dict[str, Condition] = {}
         for name, condition in conditions(self).items():
             known = [unset[name], defaults.get(name), *usual.get(name, ())]
             if getattr(self, name) not in known and not condition.holds(self):
-                unread[name] = condition
-        for name, condition in unread.items():
-            raise UnreadError(
-                f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
-                f"out, or set it to its default, {json.dumps(unset[name])}.",
-                {field_name: unset[field_name] for field_name in unread},
-            )
+                raise MemobenchError(
+                    f"--policy.{name}={getattr(self, name)} has no effect: only {condition.name} reads it; leave it "
+                    f"out, or set it to its default, {json.dumps(unset[name])}."
+                )
         if self.memory == NONE:
             self.memory_fusion = None
 
     def _complete_memory(self) -> None:
-        if self.memory == NONE:
+        mechanism = self.mechanism
+        if mechanism is None:
             if self.memory_settings in [asdict(mechanism_settings(name, {})) for name in OURS if self.memory_settings]:
                 self.memory_settings = {}  # the defaults of the memory of the checkpoint that training starts from
             return
-        mechanism = find_mechanism(self.memory)
         fitting = (OWN,) if mechanism.fusion is not None else (MODULATION, CONTEXT)
         self.memory_fusion = self.memory_fusion or fitting[0]
         if self.memory_fusion not in fitting:
@@ -407,17 +385,17 @@ class MemobenchMemConfig(PreTrainedConfig):
     def _check_alignment(self) -> None:
         if self.align == NONE:
             return
-        if self.memory == NONE:
+        if (mechanism := self.mechanism) is None:
             raise MemobenchError(
                 f"--policy.align={self.align} has no memory to align with --policy.memory=none; name a memory "
                 f"({', '.join(mechanism_names())}), or use --policy.align=none."
             )
-        if find_mechanism(self.memory).reads_text:
+        if mechanism.reads_text:
             raise MemobenchError(
                 f"--policy.align={self.align} aligns memory with the subgoal's text, and a chunk of "
                 f"memory={self.memory} reads only that text; use --policy.align=none."
             )
-        if self.align == "framewise" and not find_mechanism(self.memory).per_frame:
+        if self.align == "framewise" and not mechanism.per_frame:
             raise MemobenchError(
                 "--policy.align=framewise aligns each remembered frame with its own text, and "
                 f"memory={self.memory} has no tokens of single frames; use semantic or contrastive, or "
@@ -436,17 +414,19 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def dimensions(self) -> Dimensions:
-        """Dimensions of the size."""
         return SIZES[self.size]
 
     @property
+    def mechanism(self) -> type[MemoryMechanism] | None:
+        """Class of the memory; None for plain pi0.5."""
+        return None if self.memory == NONE else find_mechanism(self.memory)
+
+    @property
     def uses_objects(self) -> bool:
-        """Whether observations are object slots."""
         return self.perception == "objects"
 
     @property
     def uses_detector(self) -> bool:
-        """Whether objects are detected in images."""
         return self.detector is not None
 
     @property
@@ -456,7 +436,6 @@ class MemobenchMemConfig(PreTrainedConfig):
 
     @property
     def uses_images(self) -> bool:
-        """Whether images are read."""
         return self.uses_detector or not self.uses_objects
 
     @property
@@ -483,19 +462,14 @@ class MemobenchMemConfig(PreTrainedConfig):
         return side, side
 
     @property
-    def tokens_per_frame(self) -> int:
-        """Number of memory tokens of a remembered frame."""
-        return TOKENS_PER_FRAME[self.perception]
-
-    @property
     def privileged_memory(self) -> bool:
         """Whether the memory learns from texts of checkpoints."""
-        return self.memory != NONE and find_mechanism(self.memory).privileged
+        return self.mechanism is not None and self.mechanism.privileged
 
     @property
     def remembers_thumbnails(self) -> bool:
         """Whether small grey copies of images are remembered instead of their tokens."""
-        return self.memory != NONE and find_mechanism(self.memory).asks_motion and not self.uses_objects
+        return self.mechanism is not None and self.mechanism.asks_motion and not self.uses_objects
 
     @property
     def skips_repeated_frames(self) -> bool:
@@ -503,12 +477,12 @@ class MemobenchMemConfig(PreTrainedConfig):
 
         The holds of strict tasks would fill a memory of objects and use up the frames that a chunk reads.
         """
-        return OBJECT_MEMORY.holds(self)
+        return self.mechanism is not None and not self.mechanism.asks_motion and self.uses_objects
 
     def check_memory_reads(self) -> None:
         """Refuse a memory whose fusion cannot report how much a chunk reads of each remembered entry."""
-        fusion = None if self.memory == NONE else find_mechanism(self.memory).fusion
-        if self.memory == NONE or (fusion is not None and not fusion.reports_reads):
+        mechanism = self.mechanism
+        if mechanism is None or (mechanism.fusion is not None and not mechanism.fusion.watches):
             raise MemobenchError(
                 f"memory_reads=true is not available for memory={self.memory}, which has no attention weights; leave "
                 "it out"
@@ -517,7 +491,6 @@ class MemobenchMemConfig(PreTrainedConfig):
     # -- called by LeRobot -----------------------------------------------------------------------------------------
 
     def get_optimizer_preset(self) -> FusedAdamWConfig:
-        """Return the optimizer of a training."""
         assert self.optimizer_lr is not None  # set by construction
         return FusedAdamWConfig(
             lr=self.optimizer_lr,
@@ -527,19 +500,17 @@ class MemobenchMemConfig(PreTrainedConfig):
         )
 
     def get_scheduler_preset(self) -> WarmupFractionSchedulerConfig:
-        """Return the default learning-rate schedule of a training."""
         final = self.dimensions.final_learning_rate
         return WarmupFractionSchedulerConfig(warmup_fraction=self.warmup_fraction, final=final)
 
     @property
     def action_delta_indices(self) -> list[int]:
-        """Actions of a training sample, relative to its frame."""
         return list(range(self.chunk_size))
 
     observation_delta_indices = reward_delta_indices = None
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Add the objects of a dataset with images to the inputs; LeRobot does not recognise their column."""
+        # LeRobot does not recognise the column of objects in a dataset with images.
         if not self.uses_images and PRIVILEGED in features:
             shape = tuple(features[PRIVILEGED]["shape"])
             self.input_features.setdefault(OBS_ENV_STATE, PolicyFeature(FeatureType.ENV, shape))
@@ -595,10 +566,10 @@ def conditions(config: Any = MemobenchMemConfig) -> dict[str, Condition]:
 
 
 def memory_defaults() -> dict[str, Any]:
-    """Return the fields that a memory does not take over from another memory's checkpoint -> their defaults.
-
-    ``memory_settings`` are not among them: construction converts them.
-    """
-    own = {setting.name: setting.default for setting in fields(MemobenchMemConfig)}
-    of_memory = [name for name, condition in conditions().items() if condition in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)]
-    return {name: own[name] for name in of_memory if name != "memory_settings"}
+    """Return the fields that a memory does not take over from another memory's checkpoint -> their defaults."""
+    return {
+        setting.name: setting.default
+        for setting in fields(MemobenchMemConfig)
+        if setting.metadata.get("used_if") in (MEMORY, OBJECT_MEMORY, TEXT_MEMORY)
+        and setting.name != "memory_settings"  # construction converts them
+    }

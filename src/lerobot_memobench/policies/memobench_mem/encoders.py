@@ -30,19 +30,12 @@ PrefixParts = tuple[list[Tensor], list[Tensor]]
 
 
 class ObservationEncoder(ABC):
-    """Encoder of present and remembered observations, in training and in rollouts.
+    """Encoder of present and remembered observations, in training and in rollouts."""
 
-    Attributes:
-        memory_input: name of the observation that is remembered.
-        dim: D, width of the memory's input tokens.
-        tokens_per_frame: P, number of the memory's input tokens.
-        grid: side of the square of an image's tokens; 0 if tokens have no place in an image.
-    """
-
-    memory_input: str
-    dim: int
-    tokens_per_frame: int
-    grid: int
+    memory_input: str  # name of the observation that is remembered
+    dim: int  # D, width of the memory's input tokens
+    tokens_per_frame: int  # P, their number per frame
+    grid: int  # side of the square of an image's tokens; 0 if tokens have no place in an image
 
     @property
     @abstractmethod
@@ -111,10 +104,7 @@ LUMA = (0.299, 0.587, 0.114)  # of ITU-R BT.601
 
 @torch.no_grad()
 def thumbnails(images: Tensor) -> Tensor:
-    """Return small grey copies (N, 1, THUMBNAIL^2) of images (N, 3, H, W) in [0, 1].
-
-    Values are 0 ... 255, which bfloat16 holds exactly.
-    """
+    """Return grey copies (N, 1, THUMBNAIL^2) of images (N, 3, H, W); 0 ... 255, which bfloat16 holds exactly."""
     grey = (images.to(torch.float32) * images.new_tensor(LUMA, dtype=torch.float32)[:, None, None]).sum(dim=1)
     small = interpolate(grey.unsqueeze(1), (THUMBNAIL, THUMBNAIL), mode="area")
     return (255 * small).round().clamp(0, 255).flatten(2).to(torch.bfloat16)
@@ -126,9 +116,8 @@ def thumbnails(images: Tensor) -> Tensor:
 class ImageTowerEncoder(ObservationEncoder):
     """pi0.5's frozen image tower, and the projection of its tokens to the language model's width.
 
-    Args:
-        resolution: height and width of the tower's images, pixels. camera: the remembered one.
-        cameras: of the present. thumbnails: remember small grey copies instead of tokens.
+    ``resolution`` is the height and width of the tower's images; ``camera`` is remembered, as tokens or ``thumbnails``;
+    ``cameras`` are of the present.
     """
 
     tokens_per_frame = MEMORY_GRID**2
@@ -149,12 +138,10 @@ class ImageTowerEncoder(ObservationEncoder):
 
     @cached_property
     def key(self) -> str:
-        """Identity of the tokens: weights, input size and pooling."""
         weights = fingerprint({"vision_tower": self.tower, "multi_modal_projector": self.projector})
         return f"{weights}-{self.resolution[0]}x{self.resolution[1]}-mean{self.tokens_per_frame}"
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the tokens (n, 16, D) of some rows' images, or thumbnails."""
         images = batch[self.memory_input][list(rows)]
         return thumbnails(images) if self.thumbnails else self(images)
 
@@ -187,10 +174,7 @@ class ImageTowerEncoder(ObservationEncoder):
         return pooled.to(torch.bfloat16)
 
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return all patch tokens (B, g*g, D) of images (B, 3, H, W) in [-1, 1], in the images' precision.
-
-        The tower always computes in float32.
-        """
+        """Return all patch tokens (B, g*g, D) of images (B, 3, H, W) in [-1, 1]; the tower computes in float32."""
         return self.projector(self.tower(observed.to(torch.float32)).last_hidden_state).to(observed.dtype)
 
 
@@ -214,18 +198,14 @@ class PixelPool(nn.Module):
         self.project = nn.Linear(WIDTH, width)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return tokens (N, 16, width) of pooled ones (N, 16, WIDTH)."""
         tokens = self.project(frames.to(self.project.weight.dtype))
         return rms_norm(tokens, tokens.shape[-1:], eps=1e-6)
 
 
 class VisualTokenEncoder(nn.Module, ObservationEncoder):
-    """Encode the present images of all cameras by the frozen visual encoder; remember pooled tokens of one camera.
+    """Encode the present images of all ``cameras`` by the frozen visual encoder, folded.
 
-    Args:
-        tower: folded; registered as a part of the model and not here.
-        cameras: of the present. camera: the remembered one. width: of the policy's tokens.
-        thumbnails: remember small grey copies instead of tokens.
+    ``camera`` is remembered, as pooled tokens or ``thumbnails``; ``width`` is that of the policy's tokens.
     """
 
     tokens_per_frame = POOLED**2
@@ -235,14 +215,13 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         self, tower: VisualEncoder, cameras: Sequence[str], camera: str, width: int, thumbnails: bool = False
     ) -> None:
         super().__init__()
-        self._tower = (tower,)
+        self._tower = (tower,)  # the tuple hides it from torch, because the model registers it elsewhere
         self.cameras, self.memory_input, self.dim = list(cameras), camera, width
         self.thumbnails = thumbnails
         self.project = nn.Linear(WIDTH, width)
 
     @property
     def tower(self) -> VisualEncoder:
-        """The frozen visual encoder."""
         return self._tower[0]
 
     @cached_property
@@ -287,7 +266,6 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         return self.encode(batch[camera])
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return pooled tokens (n, 16, WIDTH), or thumbnails, of some rows."""
         if self.thumbnails:
             return thumbnails(batch[self.memory_input][list(rows)])
         chosen = {
@@ -296,10 +274,8 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
         return self.pooled(self._tokens(chosen, self.memory_input))
 
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return prefix tokens (B, 64, d_vlm) of a camera's tokens."""
         tokens: Tensor = self.project(observed.to(self.project.weight.dtype))
         return tokens * TOKEN_SCALE
 
     def pool(self) -> nn.Module:
-        """Return a trained projection of each frame's tokens."""
         return PixelPool(self.dim)

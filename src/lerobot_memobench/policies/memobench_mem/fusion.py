@@ -1,7 +1,4 @@
-"""How actions read memory tokens, and the operations of pi0.5's layers that this needs.
-
-`MemoryFusion` is the interface, `MemoryPass` the memory in one pass of the model. `Modulation` scales and shifts the
-input of each feed-forward layer of the action expert (RoboMME's modulator); `Context` appends memory to the prefix.
+"""How actions read memory tokens (`MemoryPass`), and the operations of pi0.5's layers that this needs.
 
 Shapes: B rows, L memory tokens, W width of the action expert, T action tokens, N queries, M keys, H heads of width d.
 """
@@ -9,8 +6,6 @@ Shapes: B rows, L memory tokens, W width of the action expert, T action tokens, 
 from __future__ import annotations
 
 import functools
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -65,9 +60,8 @@ def hidden(real: Tensor) -> Tensor:
 def attend(query: Tensor, key: Tensor, value: Tensor, bias: Tensor, collected: list[Tensor] | None = None) -> Tensor:
     """Return the attention output (B, N, H d) of queries (B, N, H, d) over keys and values (B, M, d).
 
-    Args:
-        bias: (B, 1, M), or (B, N, M) if it differs between queries, as of `hidden`.
-        collected: a list to which the attention weights (B, H, N, M) are appended.
+    ``bias``, as of `hidden`, is (B, 1, M), or (B, N, M) if it differs between queries. The attention weights
+    (B, H, N, M) are appended to ``collected``.
     """
     rows, count, heads, width = query.shape
     # All heads share keys and values, so heads are further queries of one product.
@@ -117,14 +111,22 @@ class MemoryPass:
     """The memory in one pass of the model. This base class is plain pi0.5, which reads no memory.
 
     Attributes:
-        watches: the parts of the model (``prefix``, ``actions``, ``memory``) whose attention `attention_shares` needs.
+        parts: names of the modules that `extend` adds to the model, each with a dot.
+        watches: the parts of the model (``prefix``, ``actions``, ``memory``) whose attention `attention_shares` needs;
+            none if it does not report shares.
         outputs: results of the pass other than actions, for `MemoryMechanism.losses`.
-        attention: part -> the attention weights of its layers, if the pass is watched; else empty.
+        attention: part -> the attention weights of its layers, if the pass is ``watched``; else empty.
     """
 
+    parts: ClassVar[tuple[str, ...]] = ()
     watches: ClassVar[tuple[str, ...]] = ()
 
-    def __init__(self, watched: bool = False) -> None:
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
+        """Add modules to ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
+
+    def __init__(self, model: Any = None, memory: MemoryTokens | None = None, watched: bool = False) -> None:
+        self.model = model
         self.outputs: dict[str, Tensor] = {}
         self.attention: dict[str, list[Tensor]] = {part: [] for part in self.watches} if watched else {}
 
@@ -158,26 +160,6 @@ class MemoryPass:
         return []
 
 
-class MemoryFusion(ABC):
-    """How actions read memory tokens. It is built once per model and may add parameters to it.
-
-    Attributes:
-        reports_reads: whether `MemoryPass.attention_shares` of a watched pass is implemented.
-        parts: names of the modules that it adds to the model, each with a dot.
-    """
-
-    reports_reads: ClassVar[bool] = False
-    parts: ClassVar[tuple[str, ...]] = ()
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        """Prepare ``model``: memory tokens are ``memory_dim`` wide, the action expert ``expert_dim``."""
-        self.model = model
-
-    @abstractmethod
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over a memory; ``watched``: collect attention weights for `MemoryPass.attention_shares`."""
-
-
 # -- modulation -------------------------------------------------------------------------------------------------------
 
 
@@ -192,7 +174,6 @@ class RMSNorm(nn.Module):
         self.weight = nn.Parameter(torch.zeros(width))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Normalise x (..., W), in float32."""
         return rms_norm(x) * (1.0 + self.weight)
 
 
@@ -239,13 +220,12 @@ class MemoryModulator(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return scale and shift, both (B, T, W), for actions (B, T, W) whose mean square is one.
 
-        A row whose memory is fully masked reads zeros. The attention on each memory token (B, L) is appended to
-        ``collected``.
+        The attention on each memory token (B, L) is appended to ``collected``.
         """
         weights = None if collected is None else list[Tensor]()
         query = rearrange(self.query(normed * (1.0 + self.action_norm.weight)), "b t (h d) -> b h t d", h=self.heads)
         query = rotate_from(query, memory.mask.shape[1]).transpose(1, 2)
-        # A finite bias keeps the softmax of a fully masked row finite; its result is then set to zero.
+        # A finite bias keeps the softmax of a fully masked row finite; the row then reads zeros.
         read = attend(query, keys[0], keys[1].to(query.dtype), hidden(memory.mask)[:, None], weights)
         if collected is not None and weights is not None:
             collected.append(weights[0].mean(dim=(1, 2)) * memory.mask)
@@ -255,76 +235,52 @@ class MemoryModulator(nn.Module):
 
 
 class ModulationPass(MemoryPass):
-    """A pass whose expert is scaled and shifted by memory of the expert's width W."""
+    """RoboMME's modulator: scale and shift the input of each feed-forward layer of the expert, not the residual."""
 
+    parts = ("memory_to_expert.", "modulators.")
     watches = ("memory",)
 
-    def __init__(self, memory: MemoryTokens, modulators: Sequence[MemoryModulator], watched: bool) -> None:
-        super().__init__(watched)
-        self.memory, self.modulators = memory, modulators
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
+        model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
+        layers = model.paligemma_with_expert.gemma_expert.model.layers
+        model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
+
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
+        self.memory = memory.map(model.memory_to_expert)
         # All denoising steps of a plan share their keys. In training each layer runs once, or twice by checkpointing.
-        self.keys = None if torch.is_grad_enabled() else [modulator.keys(memory) for modulator in modulators]
+        self.keys = None if torch.is_grad_enabled() else [each.keys(self.memory) for each in model.modulators]
 
     def feed_forward(self, layer: int, normed: Tensor, inputs: Tensor) -> Tensor:
-        """Scale and shift pi0.5's input; the residual is not changed."""
-        modulator = self.modulators[layer]
+        modulator = self.model.modulators[layer]
         keys = modulator.keys(self.memory) if self.keys is None else self.keys[layer]
         scale, shift = modulator(normed, self.memory, keys, self.attention.get("memory"))
         return torch.addcmul(shift, inputs, 1 + scale)
 
     def attention_shares(self) -> list[Tensor]:
-        """Return the modulators' attention to each token."""
         return self.attention["memory"]
-
-
-class Modulation(MemoryFusion):
-    """Project memory to the expert's width, and modulate each of the expert's layers."""
-
-    reports_reads = True
-    parts = ("memory_to_expert.", "modulators.")
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        super().__init__(model, memory_dim, expert_dim)
-        model.memory_to_expert = nn.Linear(memory_dim, expert_dim)
-        layers = model.paligemma_with_expert.gemma_expert.model.layers
-        model.modulators = nn.ModuleList(MemoryModulator(expert_dim) for _ in layers)
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Project the memory to the expert's width."""
-        return ModulationPass(memory.map(self.model.memory_to_expert), [*self.model.modulators], watched)
 
 
 # -- context ----------------------------------------------------------------------------------------------------------
 
 
 class ContextPass(MemoryPass):
-    """A pass whose prefix ends with the memory."""
+    """A pass whose prefix ends with the memory, which attends and is attended to like images and language."""
 
     watches = ("actions",)
 
-    def __init__(self, memory: MemoryTokens, watched: bool) -> None:
-        super().__init__(watched)
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
         self.memory = memory
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, which attends and is attended to like images and language."""
         return prefix.joined(self.memory.rows(), self.memory.mask)
 
     def attention_shares(self) -> list[Tensor]:
-        """Return the share of the actions' attention on each memory token."""
         length = self.memory.mask.shape[1]
         # (B, heads, T, prefix and T), with memory at the prefix's end
         return [
             weights[..., -weights.shape[2] - length : -weights.shape[2]].mean(dim=(1, 2))
             for weights in self.attention["actions"]
         ]
-
-
-class Context(MemoryFusion):
-    """Append memory tokens to the prefix, to which the actions attend; the model gets no further parameters."""
-
-    reports_reads = True
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over this memory."""
-        return ContextPass(memory, watched)

@@ -1,15 +1,12 @@
 """Losses of a training: of actions, and of the alignment of memory with text; sums over the ranks of a training.
 
-Actions are learned by flow matching, as in pi0.5, or by regression, with the same passes of the same model. Flow
-matching learns the velocity ``noise - actions`` at every time between noise and actions, and a chunk is integrated from
-drawn noise. Regression learns it only at zero noise and time 1, where the velocity is minus the actions, so that one
-Euler step yields the actions.
+Actions are learned by flow matching, as in pi0.5, or by regression, with the same passes of the same model. Regression
+learns the velocity ``noise - actions`` only at zero noise and time 1, where it is minus the actions, so that one Euler
+step yields the actions.
 
-The alignment follows the paper's appendix. H (B, L, d_m) are memory tokens, the mask (B, L) marks real tokens, T are
-text embeddings of width d_t. Vectors with a hat in the paper are L2-normalised here as well.
-
-DDP averages gradients over the ranks. The functions on ranks are scaled so that this average is the gradient of the
-joint batch; every rank must call them at the same time.
+The alignment follows the paper's appendix: H (B, L, d_m) are memory tokens with a mask (B, L), T text embeddings of
+width d_t. DDP averages gradients over the ranks. The functions on ranks are scaled so that this average is the gradient
+of the joint batch; every rank must call them at the same time.
 """
 
 from __future__ import annotations
@@ -56,16 +53,11 @@ ACTION_IS_PAD = "action_is_pad"
 
 
 class ActionLoss(NamedTuple):
-    """Action loss.
+    """Losses over the counted actions."""
 
-    Attributes:
-        per_sample: (B,), 0 for samples without counted actions. mean: over samples with counted actions.
-        per_dim: (A,), per dimension of an action.
-    """
-
-    per_sample: Tensor
-    mean: Tensor
-    per_dim: Tensor
+    per_sample: Tensor  # (B,), 0 for samples without counted actions
+    mean: Tensor  # over samples with counted actions
+    per_dim: Tensor  # (A,), per dimension of an action
 
 
 def counted_actions(batch: Mapping[str, Tensor], losses: Tensor) -> Tensor:
@@ -131,22 +123,18 @@ class Alignment(nn.Module, ABC):
         """Return memory vectors and their texts, both (N, d_t) and normalised."""
 
     def numbers(self) -> dict[str, float]:
-        """Return further numbers to log."""
         return {}
 
 
 class SemanticAlignment(Alignment):
     """Cosine distance between the projected mean memory token and its text: mean of 1 - z.T over the batch."""
 
-    def pairs(  # type: ignore[override]  # the tensors of `usable`
-        self, memory: Tensor, memory_mask: Tensor, text: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return projections of the masked means over memory tokens, and their texts."""
+    def pairs(self, *usable: Tensor) -> tuple[Tensor, Tensor]:
+        memory, memory_mask, text = usable
         return F.normalize(self.project(masked_mean(memory, memory_mask)), dim=-1), F.normalize(text, dim=-1)
 
-    def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
-        """Return the loss (scalar)."""
-        z, t = self.pairs(memory, memory_mask, text)
+    def forward(self, *usable: Tensor) -> Tensor:
+        z, t = self.pairs(*usable)
         return (1.0 - (z * t).sum(dim=-1)).sum() / mean_over_ranks(z.new_tensor(len(z)))
 
 
@@ -160,9 +148,8 @@ class ContrastiveAlignment(SemanticAlignment):
         super().__init__(memory_dim, text_dim)
         self.log_temperature = nn.Parameter(torch.tensor(math.log(INITIAL_TEMPERATURE)))
 
-    def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor) -> Tensor:
-        """Return the loss (scalar)."""
-        z, t = map(joint, self.pairs(memory, memory_mask, text))
+    def forward(self, *usable: Tensor) -> Tensor:
+        z, t = map(joint, self.pairs(*usable))
         logits = z @ t.T / self.log_temperature.exp()
         positive = same_text(t).to(logits.dtype)
         target = positive / positive.sum(dim=1, keepdim=True)
@@ -172,7 +159,6 @@ class ContrastiveAlignment(SemanticAlignment):
         return 0.5 * (memory_to_text + text_to_memory)
 
     def numbers(self) -> dict[str, float]:
-        """Return the learned temperature."""
         return {"align_temperature": self.log_temperature.exp().item()}
 
 
@@ -202,15 +188,12 @@ class FramewiseAlignment(Alignment):
         rank = valid.cumsum(dim=1) - 1
         return (0.5 + 0.5 * rank / (count - 1).clamp(min=1)) * valid
 
-    def pairs(  # type: ignore[override]  # the tensors of `usable`
-        self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Return valid frames and their texts."""
+    def pairs(self, *usable: Tensor) -> tuple[Tensor, Tensor]:
+        memory, memory_mask, text, text_mask = usable
         z, valid = self._frames(memory, memory_mask, text_mask)
         return z[valid], F.normalize(text, dim=-1)[valid]
 
     def forward(self, memory: Tensor, memory_mask: Tensor, text: Tensor, text_mask: Tensor) -> Tensor:
-        """Return the loss (scalar)."""
         z, valid = self._frames(memory, memory_mask, text_mask)
         # The embedding of a frame without text may be anything, even NaN.
         text = F.normalize(torch.where(rearrange(valid, "b f -> b f 1"), text, torch.ones_like(text)), dim=-1)
@@ -246,10 +229,7 @@ def alignment_loss(
     """Return the weighted loss (scalar) of memory tokens (B, L, d_m) and the texts of a batch, and numbers to log.
 
     The average of the losses of several ranks is the loss of their joint batch. There are no numbers if no sample of
-    any rank has a text.
-
-    Args:
-        encoder: the memory's parameters; the norm of their gradient is logged.
+    any rank has a text. The norm of the gradient of ``encoder``, the memory's parameters, is logged.
     """
     memory = memory.to(torch.float32)  # means over hundreds of tokens and cosines, under mixed precision too
     text, text_mask = batch[TEXT].to(memory), batch[TEXT_MASK].to(memory.device)
@@ -282,7 +262,7 @@ def world_size() -> int:
 def mean_over_ranks(value: Tensor) -> Tensor:
     """Return the mean of a number over the ranks, without gradient.
 
-    Each rank's loss is its sum divided by this mean; the average of these losses is the joint sum over the joint count.
+    The average of the ranks' sums, each divided by this mean, is the joint sum over the joint count.
     """
     value = value.detach().clone()
     if world_size() > 1:

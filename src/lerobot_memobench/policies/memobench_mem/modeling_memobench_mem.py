@@ -1,7 +1,4 @@
-"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts.
-
-This file is the policy: its construction, updates (``forward``) and actions (``select_action``).
-"""
+"""``memobench_mem``: pi0.5 with a memory, trained with or without alignment to subgoal texts."""
 
 from __future__ import annotations
 
@@ -23,12 +20,11 @@ from transformers.initialization import no_init_weights
 from lerobot_memobench.constants import EXECUTION, OBS_PHASE, OBS_STEP, PROMPT
 from lerobot_memobench.envs.settings import DELETE, NOISE, SWAP
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.perception.weights import load_visual_encoder
+from lerobot_memobench.perception.detector import load_visual_encoder
 from lerobot_memobench.policies.checkpoint import (
     as_trained,
     check_as_trained,
     check_processor_statistics,
-    check_weights,
 )
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
@@ -42,7 +38,6 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED, ObservationEncoder, VisualTokenEncoder
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.losses import (
     alignment_loss,
     counted_actions,
@@ -86,14 +81,7 @@ trained."""
 
 
 class MemobenchMemPolicy(PreTrainedPolicy):
-    """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame.
-
-    Attributes:
-        alignment: objective and head that align memory with text; None without alignment.
-        precision: of the weights.
-        rollout: the environments of the present rollout.
-        open_loop: whether observations do not follow the actions, as in replayed episodes: no hand is stalled.
-    """
+    """pi0.5 with a memory. ``forward`` and ``select_action`` read the same history at the same frame."""
 
     config_class = MemobenchMemConfig
     name = "memobench_mem"
@@ -109,19 +97,17 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         draw: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Build the policy from scratch, or from ``config.base_weights``.
+        """Build the policy from scratch, or from ``config.base_weights``; without ``dataset_meta`` it only acts.
 
-        Args:
-            dataset_meta: metadata of the dataset to train on; None: the policy only acts.
-            load_base: False if a checkpoint's weights are loaded afterwards.
-            draw: False to skip the initialisation of weights, which takes two minutes at full size.
+        ``load_base=False`` if a checkpoint's weights are loaded afterwards; then ``draw=False`` skips initial weights,
+        which take two minutes at full size.
         """
         super().__init__(config)
         config.validate_features()
         with contextlib.nullcontext() if draw else no_init_weights():
             self.model = MemoryPI05(config)
         dims = config.dimensions
-        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, config.tokens_per_frame)
+        self.alignment = make_alignment(config.align, dims.vlm.width, dims.text_dim, self.perception.tokens_per_frame)
         self.precision = Precision(list(self.parameters()))
         if dataset_meta is not None:
             self.precision.settle()  # before loading weights, which may be float32
@@ -133,13 +119,13 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.to(config.device)
-        self._watched = self.open_loop = False
+        self._watched = False
+        self.open_loop = False  # True if observations do not follow the actions, as in replayed episodes: no stalls
         self.reset()
         self._thread: int | None = None  # set by the first action
 
     @property
     def perception(self) -> ObservationEncoder:
-        """The encoder of observations."""
         return self.model.paligemma_with_expert.perception
 
     @property
@@ -182,11 +168,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
         The numbers are ``action_loss``, the memory's losses, and with an alignment ``align_loss`` (unweighted),
         ``align_grad_norm`` (of the weighted loss, over the memory's parameters) and ``align_top1`` (share of memory
-        vectors whose nearest text in the batch is their own).
-
-        Args:
-            batch: of the training's preprocessor. A policy without memory also takes those of LeRobot's own trainer.
-            reduction: ``mean`` for a scalar, ``none`` for one loss per sample (B,).
+        vectors whose nearest text in the batch is their own). ``reduction="none"`` returns a loss per sample (B,).
         """
         batch = self.perception.observed(self._with_phase(batch))
         measures = not self.training and not torch.is_grad_enabled()
@@ -195,11 +177,17 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             if measures and self.config.privileged_memory:  # actions follow the memory's own choice
                 memory = self.read_memory(_without_labels(batch))
             memory_pass = self.model.memory_pass(memory)
-            per_sample, total, logged = self._action_loss(batch, memory_pass)
+            actions = pad_vector(batch[ACTION], self.config.max_action_dim)
+            drawn = noise_and_time(self.config.objective, actions)
+            squared = self.model.forward(self._observed(batch), actions, *drawn, memory_pass)[..., : self._action_dim]
+            losses = losses_of(self.config.objective, squared)
+            loss = mean_losses(losses, counted_actions(batch, losses))
+            per_sample, total = loss.per_sample, loss.mean
+            logged = {"action_loss": total.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
             own = {} if self.model.memory is None else self.model.memory.losses({**batch, **memory_pass.outputs})
-            for name, loss in own.items():
-                per_sample, total = per_sample + loss, total + loss.mean()
-                logged[f"memory_{name}_loss"] = loss.mean().item()
+            for name, of_memory in own.items():
+                per_sample, total = per_sample + of_memory, total + of_memory.mean()
+                logged[f"memory_{name}_loss"] = of_memory.mean().item()
             if self.alignment is not None and memory is not None:
                 assert self.model.memory is not None
                 encoder = [parameter for parameter in self.model.memory.parameters() if parameter.requires_grad]
@@ -241,16 +229,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             query = query._replace(choices=batch[CHOICES][chosen].to(device), subgoal=labels)
         return query
 
-    def _action_loss(self, batch: dict[str, Tensor], memory: MemoryPass) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Return the action loss per sample (B,), its mean over the counted actions, and numbers to log."""
-        seen, actions = self._observed(batch), pad_vector(batch[ACTION], self.config.max_action_dim)
-        drawn = noise_and_time(self.config.objective, actions)
-        squared = self.model.forward(seen, actions, *drawn, memory)[:, :, : self._action_dim]
-        losses = losses_of(self.config.objective, squared)
-        loss = mean_losses(losses, counted_actions(batch, losses))
-        logged = {"action_loss": loss.mean.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
-        return loss.per_sample, loss.mean, logged
-
     # -- acting ----------------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
@@ -284,9 +262,9 @@ class MemobenchMemPolicy(PreTrainedPolicy):
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action of every environment (B, A), normalised.
 
-        An environment is replanned when its execution begins or its queue is empty (`EnvMemory.begin_chunk`). A chunk
-        depends on its own environment only. No chunk is planned in the prompt phase, in which actions have no effect,
-        and for frozen environments.
+        An environment is replanned when its execution begins or its queue is empty. A chunk depends on its own
+        environment only. No chunk is planned in the prompt phase, in which actions have no effect, and for frozen
+        environments.
         """
         self._check_thread()
         if self.training:  # calling eval() at every step would take a millisecond
@@ -384,7 +362,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         self._watched = watched
 
     def memory_reads(self) -> list[list[Chunk]]:
-        """Return the memory reads of the chunks of each environment's episode."""
         return [env.reads for env in self.rollout.envs]
 
     def _require_history(self, rows: list[int]) -> None:
@@ -463,7 +440,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
                 check_as_trained(saved, config, of)
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
-        check_weights(source, trained, revision)
         policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=has_another_memory(config, trained))
         load_weights(policy, path, source, trained)
         policy.to(config.device)

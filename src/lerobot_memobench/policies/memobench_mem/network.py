@@ -22,8 +22,8 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 from transformers.initialization import no_init_weights
 
+from lerobot_memobench.perception.detector import load_detector
 from lerobot_memobench.perception.visual_encoder import VisualEncoder
-from lerobot_memobench.perception.weights import load_detector
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.encoders import (
     TOKEN_SCALE,
@@ -34,10 +34,9 @@ from lerobot_memobench.policies.memobench_mem.encoders import (
     seed_parameters,
 )
 from lerobot_memobench.policies.memobench_mem.fusion import (
-    Context,
-    MemoryFusion,
+    ContextPass,
     MemoryPass,
-    Modulation,
+    ModulationPass,
     Prefix,
     attend,
     hidden,
@@ -47,14 +46,13 @@ from lerobot_memobench.policies.memobench_mem.fusion import (
     rotate,
     scaled_and_shifted,
 )
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism, MemorySpec, MemoryTokens
 from lerobot_memobench.policies.memobench_mem.objects import DetectionEncoder, ObjectEncoder, ObjectsFromImages
 from lerobot_memobench.policies.memobench_mem.sizes import Dimensions
 from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from lerobot_memobench.sim.object_slots import classes
 
-FUSIONS: dict[str, type[MemoryFusion]] = {"modulation": Modulation, "context": Context}
+FUSIONS: dict[str, type[MemoryPass]] = {"modulation": ModulationPass, "context": ContextPass}
 OWN = ("state_token.", "instruction.", "paligemma_with_expert.perception.")
 """Prefixes of the names of further parameters that plain pi0.5 does not have, except for the memory's."""
 PERIODS = 4e-3, 4.0
@@ -66,31 +64,20 @@ POSITION_SCALE = 8.0
 
 
 class Observation(NamedTuple):
-    """Inputs of a pass.
+    """Inputs of a pass; in a model with a state token, the last of the ``images`` is the state (B, dim)."""
 
-    Attributes:
-        images: images or tokens of each part of the observation; in a model with a state token, the last is the
-            state (B, dim). image_masks: (B,) or (B, n) bool of each part, False if it is missing.
-        words: (B, n) token numbers of the instruction. word_masks: (B, n) bool, False for padding.
-    """
-
-    images: list[Tensor]
-    image_masks: list[Tensor]
-    words: Tensor
-    word_masks: Tensor
+    images: list[Tensor]  # images or tokens of each part of the observation
+    image_masks: list[Tensor]  # (B,) or (B, n) bool of each part, False if it is missing
+    words: Tensor  # (B, n) token numbers of the instruction
+    word_masks: Tensor  # (B, n) bool, False for padding
 
 
 class PrefixKeys(NamedTuple):
-    """The part of a prefix to which actions attend.
+    """The part of a prefix to which actions attend."""
 
-    Attributes:
-        keys: per layer, keys and values (B, M, d). bias: (B, 1, M), added to attention scores.
-        length: (B, 1), number of real tokens of the prefix, which is the position of the first action.
-    """
-
-    keys: list[tuple[Tensor, Tensor]]
-    bias: Tensor
-    length: Tensor
+    keys: list[tuple[Tensor, Tensor]]  # keys and values (B, M, d) of each layer
+    bias: Tensor  # (B, 1, M), added to attention scores
+    length: Tensor  # (B, 1), number of real tokens of the prefix, which is the position of the first action
 
 
 class MemoryPI05(nn.Module):
@@ -100,7 +87,7 @@ class MemoryPI05(nn.Module):
     kept, and one over the actions for each step of denoising.
 
     Attributes:
-        memory: the memory mechanism. fusion: how actions read its tokens. None: plain pi0.5.
+        memory: the memory mechanism; None: plain pi0.5. fusion: how actions read its tokens.
         state_token: encodes the robot's state as a token; None: the text prompt spells the state.
         instruction: with a state token, maps the instruction to a condition of the action expert's norms.
     """
@@ -118,22 +105,34 @@ class MemoryPI05(nn.Module):
         self.state_token = StateToken(config.max_state_dim, vlm_width) if config.state_token else None
         self.instruction = InstructionCondition(vlm_width, width) if config.state_token else None
         self.memory: MemoryMechanism | None = None
-        self.fusion: MemoryFusion | None = None
-        if config.memory == NONE:
+        self.fusion: type[MemoryPass] = MemoryPass
+        if (mechanism := config.mechanism) is None:
             return
-        self.memory = make_memory(config, self.paligemma_with_expert.perception)
-        self.fusion = (self.memory.fusion or FUSIONS[str(config.memory_fusion)])(self, vlm_width, width)
+        observations = self.paligemma_with_expert.perception
+        spec = MemorySpec(
+            dim=observations.dim,
+            tokens=observations.tokens_per_frame,
+            width=vlm_width,
+            expert=width,
+            grid=observations.grid,
+            stride=config.memory_stride,
+            subgoals=texts_of(config.subgoals or {}),
+        )
+        pool, settings = mechanism.make_pool(observations, spec), mechanism.Settings(**config.memory_settings)
+        self.memory = mechanism(spec, pool, settings)
+        self.fusion = self.memory.fusion or FUSIONS[str(config.memory_fusion)]
+        self.fusion.extend(self, vlm_width, width)
 
     def memory_pass(self, memory: MemoryTokens | None, watched: bool = False) -> MemoryPass:
-        """Begin a pass over memory tokens; None: plain pi0.5. ``watched`` is as of `MemoryFusion.begin`."""
-        return MemoryPass() if self.fusion is None or memory is None else self.fusion.begin(memory, watched)
+        """Begin a pass over memory tokens; None: plain pi0.5. A ``watched`` one collects attention weights."""
+        return MemoryPass() if memory is None else self.fusion(self, memory, watched)
 
     # -- passes ------------------------------------------------------------------------------------------------------
 
     def embed(self, seen: Observation, memory: MemoryPass) -> Prefix:
         """Return the prefix: observation, words, and the additions of the memory."""
         words, masks = seen.words, seen.word_masks
-        if (self.state_token is not None or self.training) and not masks.is_meta:  # padding is most of a short prefix
+        if self.state_token is not None or self.training:  # padding is most of a short prefix
             longest = int(masks.sum(dim=1).max())
             words, masks = words[:, :longest], masks[:, :longest]
         embedded, state, instruction = self.paligemma_with_expert.embed_language_tokens(words), None, None
@@ -229,7 +228,6 @@ class MemoryPI05(nn.Module):
     # -- parameters --------------------------------------------------------------------------------------------------
 
     def gradient_checkpointing_enable(self) -> None:
-        """Recompute layers in the backward pass instead of storing their activations."""
         self.gradient_checkpointing_enabled = True
         self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing = True
 
@@ -240,24 +238,7 @@ class MemoryPI05(nn.Module):
 
     def memory_names(self) -> set[str]:
         """Return the names of the tensors of the memory and of its fusion."""
-        parts = ("memory.",) if self.fusion is None else ("memory.", *self.fusion.parts)
-        return {name for name in self.state_dict() if name.startswith(parts)}
-
-
-def make_memory(config: MemobenchMemConfig, observations: ObservationEncoder) -> MemoryMechanism:
-    """Build the memory mechanism of a policy with this encoder of observations."""
-    mechanism, dims = find_mechanism(config.memory), config.dimensions
-    spec = MemorySpec(
-        dim=observations.dim,
-        tokens=config.tokens_per_frame,
-        width=dims.vlm.width,
-        expert=dims.expert.width,
-        grid=observations.grid,
-        stride=config.memory_stride,
-        subgoals=texts_of(config.subgoals or {}),
-    )
-    settings = mechanism_settings(config.memory, config.memory_settings)
-    return mechanism(spec, mechanism.make_pool(observations, spec), settings)
+        return {name for name in self.state_dict() if name.startswith(("memory.", *self.fusion.parts))}
 
 
 class StateToken(nn.Module):
@@ -268,20 +249,17 @@ class StateToken(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(dim, width), nn.GELU(), nn.Linear(width, width))
 
     def forward(self, state: Tensor) -> Tensor:
-        """Return the token (B, 1, width) of a state (B, dim)."""
         return rearrange(self.mlp(state) * TOKEN_SCALE, "b d -> b 1 d")
 
 
 class InstructionCondition(nn.Module):
     """Map the instruction to a condition of the action expert's norms, which is added to the denoising time.
 
-    Each word is scaled by a vector of its position before the mean, so that the condition depends on the words' order.
-    On a task with six orders, after 700 updates, the first drawer was right in 12 of 12 rollouts with vectors of
-    `POSITION_SCALE`, in 6 with vectors of scale 1 (one training seed, validation seeds).
-
-    With attention only, the model has to find the single word in which two instructions differ. On six tasks of one
-    cabinet, one microwave and one stove, after 2,000 updates, the loss was 2 % lower with this condition, and 28 of 30
-    rollouts were solved instead of 24 (one training seed, validation seeds).
+    With attention only, the model has to find the single word in which two instructions differ. On six tasks, after
+    2,000 updates, the loss was 2 % lower with this condition, and 28 of 30 rollouts were solved instead of 24. Each
+    word is scaled by a vector of its position before the mean, so that the condition depends on the words' order. On a
+    task with six orders, after 700 updates, the first drawer was right in 12 of 12 rollouts with vectors of
+    `POSITION_SCALE`, in 6 with vectors of scale 1 (both: one training seed, validation seeds).
     """
 
     def __init__(self, words_dim: int, width: int) -> None:
@@ -367,10 +345,10 @@ def _action_layer(
 def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     """Build LeRobot's PaliGemma and action expert at a policy's dimensions, with an encoder of observations.
 
-    LeRobot fixes vocabulary, image tower and widths in its constructor, so that runs on the meta device, which takes no
-    memory and no time, before the modules are built. Image tower, its projection and the language heads are frozen.
+    Image tower, its projection and the language heads are frozen.
     """
     dims, image_size = config.dimensions, config.image_size[0]
+    # LeRobot's constructor fixes vocabulary, image tower and widths, so it runs on the meta device, without memory.
     with torch.device("meta"), no_init_weights():
         backbone: Any = PaliGemmaWithExpertModel(
             GemmaConfig(**vars(dims.vlm)),
@@ -398,15 +376,15 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     # Cached tokens are projected, so the projection is frozen with the tower. pi0.5 does not use its language heads.
     for module in (tower.multi_modal_projector, backbone.paligemma.lm_head, backbone.gemma_expert.lm_head):
         module.requires_grad_(False)
-    backbone.perception = _perception(config, tower)
+    backbone.perception = _make_encoder(config, tower)
     typed: PaliGemmaWithExpertModel = backbone
     return typed
 
 
-def _perception(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
+def _make_encoder(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:
     width, camera, thumbnails = config.dimensions.vlm.width, config.memory_camera or "", config.remembers_thumbnails
     if config.uses_visual_encoder:
-        tower = vlm.vision_tower = VisualEncoder(folded=True).eval().requires_grad_(False)
+        tower = vlm.vision_tower = VisualEncoder().fold().eval().requires_grad_(False)
         vlm.multi_modal_projector = nn.Identity()
         return VisualTokenEncoder(tower, [*config.image_features], camera, width, thumbnails)
     if not config.uses_objects:
@@ -436,11 +414,10 @@ def _resize(vlm: Any, dims: Dimensions, image_size: int) -> Any:
 
 
 class Precision:
-    """Keep trainable parameters of a bfloat16 policy in float32 and frozen ones in bfloat16.
+    """Keep trainable parameters of a bfloat16 policy in float32 and frozen ones in bfloat16, as openpi does.
 
-    A bfloat16 weight near 1 has steps of 1/128, so updates at a learning rate of 5e-5 would round to zero. As in the
-    reference implementation of pi0.5, trained weights are float32 and autocast rounds them for each pass. Frozen
-    weights, and all weights of a policy that only acts, keep LeRobot's bfloat16.
+    A bfloat16 weight near 1 has steps of 1/128, so updates at a learning rate of 5e-5 would round to zero. Autocast
+    rounds trained weights for each pass. All weights of a policy that only acts keep LeRobot's bfloat16.
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:

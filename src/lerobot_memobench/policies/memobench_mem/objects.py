@@ -74,9 +74,7 @@ def slot_features(slots: Tensor, hand: Tensor) -> Tensor:
 class SlotEncoder(nn.Module):
     """Encode each object in slots by a network of two layers; empty slots are skipped.
 
-    Args:
-        order: class index of this version -> index among the classes of training, or their number for a new class.
-        kinds: number of classes of training, plus one for new classes. hidden: width between the two layers.
+    ``order`` maps the class indices of this version to those of training, which are ``kinds`` with one for new classes.
     """
 
     def __init__(self, order: Sequence[int], kinds: int, hidden: int, width: int) -> None:
@@ -117,11 +115,7 @@ def in_slots(vectors: Tensor, present: Tensor, empty: float = 0.0) -> Tensor:
 
 
 class ObjectPool(nn.Module):
-    """Pool the objects of a stored frame to `OBJECT_TOKENS` tokens of unit size by learned attention.
-
-    Without the norm, the initial output is several times smaller than the encoding of time that is added to it. With
-    it, 400 updates chose the right one of three bowls in 85 % of frames, instead of 58 %.
-    """
+    """Pool the objects of a stored frame to `OBJECT_TOKENS` tokens of unit size by learned attention."""
 
     def __init__(self, order: Sequence[int], kinds: int, width: int, phase: bool = False) -> None:
         super().__init__()
@@ -141,21 +135,20 @@ class ObjectPool(nn.Module):
         if self.phase is not None:
             pooled = pooled + self.phase(phase).unsqueeze(1)
         tokens: Tensor = self.out(pooled)
+        # Without the norm, the initial output is several times smaller than the encoding of time that is added to it.
+        # With it, 400 updates chose the right one of three bowls in 85 % of frames, instead of 58 %.
         return rms_norm(tokens, tokens.shape[-1:], eps=1e-6)
 
     def phases(self, frames: Tensor) -> Tensor:
         """Return tokens of frames without objects and hand, which hold only the phase."""
-        blank: Tensor = self(pad(frames[..., -1:], (frames.shape[-1] - 1, 0)))
-        return blank
+        return self.forward(pad(frames[..., -1:], (frames.shape[-1] - 1, 0)))
 
 
 class ObjectEncoder(nn.Module, ObservationEncoder):
     """A token per present object; a remembered frame is stored as numbers for `ObjectPool`.
 
-    Args:
-        trained: names of the classes of training, in order of their indices. width: of all tokens.
-        noise: size of the detection noise added to slots in training; 0: none.
-        phase: whether a remembered frame records its phase.
+    ``trained`` are the classes of training in order of their indices, ``width`` is that of all tokens, ``noise`` the
+    size of the detection noise in training, and ``phase`` whether a remembered frame records its phase.
     """
 
     memory_input = OBS_ENV_STATE
@@ -185,14 +178,10 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         return {**batch, **remembered, OBS_ENV_STATE: noisy[len(stored) :]}
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return slots and hand (B, n WIDTH + 6), and which of the n slots hold an object (B, n).
-
-        In training, n is the largest number of objects in the batch; in a rollout it is `SLOTS`, so that a row does not
-        depend on others.
-        """
+        """Return slots and hand (B, n WIDTH + 6), and which of the n slots hold an object (B, n)."""
         slots = batch[OBS_ENV_STATE].to(torch.float32).unflatten(1, (SLOTS, WIDTH))
         hand = batch[OBS_RAW_STATE][:, :HAND_DIM].to(slots)
-        if self.training:
+        if self.training:  # in a rollout, a row must not depend on others
             slots = slots[:, : max(1, int((slots[..., 0] > 0).sum(dim=1).max()))]
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
@@ -204,13 +193,11 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         return frame_row(slots, state.to(slots), phase.to(slots))
 
     def prefix(self, observed: Tensor) -> Tensor:
-        """Return a token (B, n, d_vlm) per slot of `present`; zeros for empty slots."""
         slots, hand = observed[:, :-HAND_DIM], observed[:, -HAND_DIM:]
         vectors, present = self.slot(slots.unflatten(1, (-1, WIDTH)), hand)
         return in_slots(vectors * TOKEN_SCALE, present)
 
     def pool(self) -> nn.Module:
-        """Return a pool of each frame's objects."""
         return ObjectPool(self.order, self.kinds, self.dim, self.phase)
 
 
@@ -231,7 +218,6 @@ class ObjectsFromImages:
 
     @cached_property
     def key(self) -> str:
-        """Identity of the detections: weights, and size of the images."""
         return f"{fingerprint({'detector': self._detector})}-{SIDE}x{SIDE}-objects-{SIZE}"
 
     def __call__(self, images: Mapping[str, Tensor], states: Tensor) -> Tensor:
@@ -248,23 +234,20 @@ class ObjectsFromImages:
 class DetectionEncoder(ObjectEncoder):
     """A token per object detected in the present images, instead of privileged object state.
 
-    The trained layers are those of `ObjectEncoder`, so a policy trained on privileged object state also acts from
-    images. The detector (``detect``) is no module, so that a checkpoint holds only its name.
+    The trained layers are those of `ObjectEncoder`, so a policy trained on privileged object state acts from images.
     """
 
     memory_input = next(iter(VIEWS))
 
     def __init__(self, detect: ObjectsFromImages, trained: Sequence[str], width: int, phase: bool = False) -> None:
         super().__init__(trained, width, phase=phase)
-        self.detect = detect
+        self.detect = detect  # no module, so that a checkpoint holds only its name
         self.key = detect.key
 
     def present(self, batch: Mapping[str, Tensor]) -> PrefixParts:
-        """Return the slots of detections in the batch or in its images."""
         return super().present(self._with_objects(batch))
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the stored frames (n, 1, D') of some rows."""
         wanted = {DETECTED} if DETECTED in batch else {*VIEWS}
         chosen = {key: value[list(rows)] for key, value in batch.items() if key in wanted | {OBS_RAW_STATE, OBS_PHASE}}
         return super().remember(self._with_objects(chosen), range(len(rows)))
@@ -299,10 +282,9 @@ second copy of a thing; and the distance of either kind from the thing, m."""
 
 
 def with_detection_noise(slots: Tensor, hand: Tensor, size: float) -> Tensor:
-    """Return slots (N, SLOTS, WIDTH) with the errors of a detector.
+    """Return slots (N, SLOTS, WIDTH) with the errors of a detector, times ``size``.
 
-    Args:
-        hand: (N, >= 3), its place in the world, m. size: factor of the errors; 1: those of the package's detector.
+    ``hand`` (N, >= 3) is its place in the world, m.
     """
     noisy = upright(slots)
     present = field(noisy, "present").squeeze(-1) > 0

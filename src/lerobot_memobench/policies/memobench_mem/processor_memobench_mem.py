@@ -16,7 +16,6 @@ from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from lerobot.processor import (
     ObservationProcessorStep,
-    PolicyAction,
     PolicyProcessorPipeline,
     ProcessorStep,
     ProcessorStepRegistry,
@@ -36,7 +35,6 @@ from torch.nn.utils.rnn import pad_sequence
 from lerobot_memobench.datasets.frames import FrameLookup
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
-from lerobot_memobench.policies.memobench_mem.memory import NONE, find_mechanism, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     AHEAD,
     CHOICES,
@@ -61,26 +59,18 @@ def make_memobench_mem_pre_post_processors(
     dataset_stats: dict[str, dict[str, Any]] | None = None,
     dataset_meta: Any | None = None,
     lookup: FrameLookup | None = None,
-) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
-    PolicyProcessorPipeline[PolicyAction, PolicyAction],
-]:
+) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Build both processors of a new policy (LeRobot's factory calls this unless it loads saved ones).
 
-    Args:
-        dataset_meta: metadata of the training dataset, whose task texts give the words of the word tokenizer. LeRobot
-            0.6.1 sets it as an attribute of the config instead.
-        lookup: its frames; None in LeRobot's own trainer, and for a policy that only acts.
-
-    Raises:
-        MemobenchError: there are no statistics, as for a policy that was never trained.
+    The task texts of ``dataset_meta``, the training dataset, give the words of the word tokenizer. ``lookup`` are its
+    frames; None in LeRobot's own trainer, and for a policy that only acts.
     """
     if not dataset_stats:
         raise MemobenchError(
             "memobench_mem has no dataset statistics to normalise states and actions; evaluate a trained checkpoint "
             "with --policy.path=<folder of pretrained_model>."
         )
-    meta = dataset_meta or getattr(config, "_runtime_dataset_meta", None)
+    meta = dataset_meta or getattr(config, "_runtime_dataset_meta", None)  # LeRobot 0.6.1 sets the attribute
     steps = make_default_policy_processor_steps(config, dataset_stats)
     input_steps: list[ProcessorStep] = [
         steps.rename_observations,
@@ -145,7 +135,6 @@ class LookupProcessorStep(ProcessorStep):
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Leave the features as they are."""
         return features
 
 
@@ -156,33 +145,24 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
 
     Training samples get the parts of their `Histories`, ``phase`` (B,), and features of the frames
     (``observation.encoded.*``). An alignment adds ``memory.text`` and ``memory.text_mask``: (B, d_t) and (B,) of the
-    frame itself, or with ``framewise`` (B, F, d_t) and (B, F) of the remembered frames.
-
-    In a rollout, where the policy itself keeps the history, and in LeRobot's own trainer, only ``memory.choices``
-    (B, S) is added: which texts of ``subgoals`` belong to the task.
-
-    Args:
-        subgoals: instruction -> texts of its checkpoints, of a privileged memory; saved with the checkpoint.
-        config: the policy's; None if the step is loaded to act.
+    frame itself, or with ``framewise`` (B, F, d_t) and (B, F) of the remembered frames. In a rollout, where the policy
+    itself keeps the history, only ``memory.choices`` (B, S) is added: which texts of ``subgoals`` belong to the task.
     """
 
     subgoals: dict[str, list[str]] = field(default_factory=dict)
+    """Instruction -> texts of its checkpoints, of a privileged memory; saved with the checkpoint."""
     config: MemobenchMemConfig | None = field(default=None, repr=False, kw_only=True)
+    """The policy's; None if the step is loaded to act."""
 
     def __post_init__(self) -> None:
-        if self.config is None:
-            return
-        self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
-        if self.config.memory != NONE:
-            self._settings = mechanism_settings(self.config.memory, self.config.memory_settings)
+        if self.config is not None:
+            self.subgoals = (self.config.subgoals or {}) if self.config.privileged_memory else {}
 
     def follow(self, config: MemobenchMemConfig, lookup: FrameLookup) -> None:
-        """Set the configuration and the frames of a training."""
         self.config, self.lookup = config, lookup
         self.__post_init__()
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Add what `gather` returns."""
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if self.subgoals:
             extra = {**extra, CHOICES: choices(self.subgoals, extra.get("task") or [])}
@@ -190,16 +170,15 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         indices, lookup = self.sample_indices(transition), self.lookup
         if indices is None or lookup is None:
             return transition
-        transition = transition.copy()
-        transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, **self.gather(lookup, indices)}
         observation = transition.get(TransitionKey.OBSERVATION) or {}
         # In a dataset with images the column of objects is no observation of LeRobot's.
         if OBS_ENV_STATE in lookup.columns and OBS_ENV_STATE not in observation:
-            transition[TransitionKey.OBSERVATION] = {
-                **observation,
-                OBS_ENV_STATE: lookup.columns[OBS_ENV_STATE][indices],
-            }
-        return transition
+            observation = {**observation, OBS_ENV_STATE: lookup.columns[OBS_ENV_STATE][indices]}
+        return {
+            **transition,
+            TransitionKey.OBSERVATION: observation,
+            TransitionKey.COMPLEMENTARY_DATA: {**extra, **self.gather(lookup, indices)},
+        }
 
     def gather(self, lookup: FrameLookup, indices: Sequence[int]) -> dict[str, Tensor]:
         """Return what the class describes for frames of the dataset, by their global indices."""
@@ -208,9 +187,9 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         located = [lookup.locate(index) for index in indices]
         features = {PHASE: torch.from_numpy(lookup.phase[np.asarray(indices)].astype(np.int64))}
         features |= {name: encoded(indices) for name, encoded in lookup.encoded.items()}
-        if config.memory == NONE:
+        if (mechanism := config.mechanism) is None:
             return features
-        mechanism, stride, settings = find_mechanism(config.memory), lookup.stride, self._settings
+        stride, settings = lookup.stride, mechanism.Settings(**config.memory_settings)
 
         def slots(episode: int, last: int) -> np.ndarray:
             if not config.skips_repeated_frames:
@@ -239,7 +218,6 @@ class GatherMemoryProcessorStep(LookupProcessorStep):
         return memory | features | {TEXT: embedded, TEXT_MASK: asked_texts >= 0}
 
     def get_config(self) -> dict[str, Any]:
-        """Return the saved settings."""
         return {"subgoals": self.subgoals} if self.subgoals else {}
 
 
@@ -279,18 +257,12 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
     """Append ground-truth memory text to the instruction before tokenization: a control of the paper.
 
     In training the text comes from the dataset's column ``memory``; in a rollout the environment appends it. An
-    environment without this text is refused, because the policy would act without the memory of its training. A step
-    that is not ``enabled`` has no effect.
+    environment without this text is refused, because the policy would act without the memory of its training.
     """
 
     enabled: bool = True
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
-        """Append the text.
-
-        Raises:
-            MemobenchError: a rollout's instruction has no memory text, or LeRobot's own trainer runs the step.
-        """
         if not self.enabled:
             return transition
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
@@ -309,12 +281,9 @@ class OracleMemoryProcessorStep(LookupProcessorStep):
                 "This policy was trained with oracle_memory=true and the environment gives no memory text; evaluate it "
                 "with --env.oracle_memory=true."
             )
-        transition = transition.copy()
-        transition[TransitionKey.COMPLEMENTARY_DATA] = {**extra, "task": tasks}
-        return transition
+        return {**transition, TransitionKey.COMPLEMENTARY_DATA: {**extra, "task": tasks}}
 
     def get_config(self) -> dict[str, Any]:
-        """Return the saved settings."""
         return {"enabled": self.enabled}
 
 
@@ -324,14 +293,12 @@ class RawStateProcessorStep(ObservationProcessorStep):
     """Copy the state (B, n), m and rad, to ``observation.raw_state`` before normalisation, for places of objects."""
 
     def observation(self, observation: dict) -> dict:
-        """Copy the state."""
         copied = {OBS_RAW_STATE: observation[OBS_STATE].clone()} if OBS_STATE in observation else {}
         return observation | copied
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Leave the features as they are."""
         return features
 
 
@@ -341,10 +308,7 @@ _SPECIAL = ("<pad>", "<unk>", "<bos>", "<eos>")
 
 
 def make_vocabulary(texts: Iterable[str], size: int) -> list[str]:
-    """Return words for `WordTokenizerProcessorStep`: special tokens, the prompt's frame, states 0-255, then ``texts``.
-
-    At most ``size`` words are kept, the most frequent.
-    """
+    """Return words for `WordTokenizerProcessorStep`: special tokens, frame of the prompt, states 0-255, ``texts``."""
     return extend([*_SPECIAL, *"-:;,.", "task", "state", "action", *map(str, range(256))], texts, size)
 
 
@@ -376,10 +340,7 @@ _warned: set[str] = set()
 
 
 def warn_of_losses(tokenizer: Any, text: str, max_length: int, full: bool) -> None:
-    """Warn about unknown words of a prompt, each once per process, and about cut prompts, once per instruction.
-
-    A prompt that is ``full`` may have been cut.
-    """
+    """Warn of unknown words, each once per process, and of cut (``full``) prompts, once per instruction."""
     prompt = text.partition(", State: ")[0]
     instruction = prompt.partition(MARK)[0].removeprefix("Task: ")
     if f"read {prompt}" in _warned and (not full or f"cut {instruction}" in _warned):
@@ -419,8 +380,7 @@ class PromptTokenizerProcessorStep(TokenizerProcessorStep):
         return encoded
 
     def save_artifacts(self, save_directory: Path) -> dict[str, str]:
-        """Save no tokenizer files: the settings hold the tokenizer's name or words."""
-        return {}
+        return {}  # the settings hold the tokenizer's name or words
 
 
 @dataclass
@@ -444,19 +404,17 @@ class WordTokenizerProcessorStep(PromptTokenizerProcessorStep):
         super().__post_init__()
 
     def follow(self, config: MemobenchMemConfig, texts: Sequence[str]) -> None:
-        """Add the words of a training's prompts, and set their length."""
         assert config.tokenizer_max_length is not None  # set by the configuration
         self.max_length = config.tokenizer_max_length
         self.vocabulary = extend(self.vocabulary, texts, config.dimensions.vocabulary)
         self.__post_init__()
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, Tensor]:
-        """Tokenize each different text once, because the samples of a batch share a few instructions."""
+        # Each different text is tokenized once, because the samples of a batch share a few instructions.
         texts = [text] if isinstance(text, str) else text
         row = {different: number for number, different in enumerate(dict.fromkeys(texts))}
         rows = torch.tensor([row[text] for text in texts])
         return {name: of_different[rows] for name, of_different in super()._tokenize_text([*row]).items()}
 
     def get_config(self) -> dict[str, Any]:
-        """Return the saved settings with the vocabulary."""
         return super().get_config() | {"vocabulary": self.vocabulary}

@@ -21,32 +21,22 @@ STALLED, PER_RADIAN = 0.006, 0.1
 
 @dataclass
 class EnvMemory:
-    """The episode of one environment of a batch.
+    """The episode of one environment of a batch."""
 
-    Attributes:
-        clock: phase and control step since the phase began. position: control step since the episode began.
-        memory: state of the memory mechanism; None before the first frame. intact: its state before a corruption.
-        emptied: whether the next frame is the memory's first, after a corruption. stored: the last written frame.
-        missed: step of the first frame that should have been written and was not observed.
-        queue: remaining planned actions. last: the last action (A,).
-        pose: of the hand when the last chunk was planned. skipped: actions of that chunk that were left out.
-        reads: memory reads of the episode's chunks, if they are watched.
-    """
-
-    clock: tuple[int, int] | None = None
-    position: int = 0
+    clock: tuple[int, int] | None = None  # phase and control step since the phase began
+    position: int = 0  # control step since the episode began
     frozen: bool = False
-    memory: Any = None
-    intact: Any = None
-    emptied: bool = False
-    stored: Tensor | None = None
-    missed: int | None = None
+    memory: Any = None  # state of the memory mechanism; None before the first frame
+    intact: Any = None  # its state before a corruption
+    emptied: bool = False  # whether the next frame is the memory's first, after a corruption
+    stored: Tensor | None = None  # the last written frame
+    missed: int | None = None  # step of the first frame that should have been written and was not observed
     seed: int = 0
-    queue: deque[Tensor] = field(default_factory=deque)
-    last: Tensor | None = None
-    pose: Tensor | None = None
-    skipped: int = 0
-    reads: list[Chunk] = field(default_factory=list)
+    queue: deque[Tensor] = field(default_factory=deque)  # remaining planned actions
+    last: Tensor | None = None  # the last action (A,)
+    pose: Tensor | None = None  # of the hand when the last chunk was planned
+    skipped: int = 0  # actions of that chunk that were left out
+    reads: list[Chunk] = field(default_factory=list)  # memory reads of the chunks, if they are watched
 
     def drop_chunk(self) -> None:
         """Discard planned actions; the action is zero until the next plan."""
@@ -58,10 +48,8 @@ class EnvMemory:
 
         A hand that replans the same action after too few steps could stall forever. A hand whose pose is bit-identical
         has not stalled: the environment holds it, or it rests. A plan has ``count`` actions in all cases, as the policy
-        declares to the environment, so that plans stay in step with its holds.
-
-        Args:
-            state: the robot's state (8,), m and rad, to compare with that of the last chunk; None: never stalled.
+        declares to the environment, so that plans stay in step with its holds. ``state`` (8,) is the robot's, m and
+        rad, to compare with that of the last chunk; None: never stalled.
         """
         pose = None
         if state is not None:
@@ -88,8 +76,7 @@ class EnvMemory:
 class Rollout:
     """The environments of a vector environment, of which every ``stride``-th frame is written, if any (``remembers``).
 
-    The clock of an environment shows that an episode begins or has ended (`begins_episode`, `is_frozen`). An episode's
-    first frame is always written. If observations have no clock, each observation is a control step.
+    An episode's first frame is always written. If observations have no clock, each observation is a control step.
     """
 
     def __init__(self, remembers: bool, stride: int) -> None:
@@ -97,9 +84,8 @@ class Rollout:
         self.envs: list[EnvMemory] = []
 
     def observe(self, clocks: Sequence[tuple[int, int]], write: Callable[[list[int]], None]) -> list[bool]:
-        """Process one observation per environment; return in which of them a new episode began.
+        """Process the clock of each environment, as of `EnvMemory`; return in which of them a new episode began.
 
-        ``clocks`` holds the phase (0 prompt, 1 execution) of each, and the control step since the phase began.
         ``write`` writes the frames of given environments; it is called at most once.
         """
         if len(self.envs) != len(clocks):

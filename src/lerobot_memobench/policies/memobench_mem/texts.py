@@ -149,20 +149,16 @@ class WordTextEncoder:
     Different texts nearly always have cosines well below 0.99.
     """
 
-    def __init__(self, dim: int) -> None:
-        self.dim = dim
+    name = "words"
 
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings."""
-        return f"words-1-{self.dim}"
+    def __init__(self, dim: int) -> None:
+        self.dim, self.key = dim, f"{self.name}-1-{dim}"
 
     def _vector(self, token: str) -> Tensor:
         seed = int.from_bytes(hashlib.blake2b(token.encode(), digest_size=7).digest(), "big")
         return torch.randn(self.dim, generator=torch.Generator().manual_seed(seed))
 
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return normalised embeddings (N, dim), float32."""
         rows = [torch.stack([self._vector(token) for token in self._tokens(text)]).sum(dim=0) for text in texts]
         return F.normalize(torch.stack(rows), dim=-1)
 
@@ -174,10 +170,7 @@ class WordTextEncoder:
 class LabelTextEncoder(WordTextEncoder):
     """Embed each text as one random vector, independent of its words: a control without language."""
 
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings."""
-        return f"labels-1-{self.dim}"
+    name = "labels"
 
     def _tokens(self, text: str) -> list[str]:
         return [text]
@@ -188,15 +181,10 @@ class SiglipTextEncoder:
 
     def __init__(self, name: str, dim: int, device: str = "cpu") -> None:
         self.name, self.dim, self.device = name, dim, device
-
-    @property
-    def key(self) -> str:
-        """Identity of the embeddings: the model's name without its folder."""
-        return f"siglip-{self.name.rstrip('/').rsplit('/', 1)[-1]}-{self.dim}"
+        self.key = f"siglip-{name.rstrip('/').rsplit('/', 1)[-1]}-{dim}"  # the model's name without its folder
 
     @torch.no_grad()
     def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Return pooled text features (N, dim), float32."""
         tokenizer, model = self._load()
         rows = []
         for part in itertools.batched(texts, 64):
@@ -226,5 +214,5 @@ class SiglipTextEncoder:
 
 def make_text_encoder(name: str, dim: int, device: str = "cpu") -> WordTextEncoder | SiglipTextEncoder:
     """Build a text encoder: ``words``, ``labels``, or the folder or repository of a SigLIP model."""
-    built_in = {"words": WordTextEncoder, "labels": LabelTextEncoder}
+    built_in = {encoder.name: encoder for encoder in (WordTextEncoder, LabelTextEncoder)}
     return built_in[name](dim) if name in built_in else SiglipTextEncoder(name, dim, device)

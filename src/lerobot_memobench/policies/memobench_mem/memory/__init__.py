@@ -13,10 +13,9 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, get_type_hints
 
-import draccus
-
 from lerobot_memobench.errors import MemobenchError, nearest
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import MemoryMechanism
+from lerobot_memobench.untrusted import Malformed, checked
 
 logger = logging.getLogger(__name__)
 
@@ -91,29 +90,20 @@ def mechanism_settings(name: str, values: Mapping[str, Any]) -> Any:
 
     A `MemobenchError` if a setting is unknown, or has a wrong type or value.
     """
-    known = setting_names(name)
-    for key in values:
+    settings, known = find_mechanism(name).Settings, setting_names(name)
+    for key, value in values.items():
         if key not in known:
             hint = nearest(key, known) if known else "it has no settings."
             raise MemobenchError(f"policy.memory_settings: unknown setting '{key}' for memory={name}; {hint}")
-    settings = find_mechanism(name).Settings
-    for key, value in values.items():
-        _check_type(name, key, value, get_type_hints(settings)[key])
+        kind = get_type_hints(settings)[key]
+        try:
+            checked(value, kind)
+        except Malformed:
+            expected = kind.__name__ if isinstance(kind, type) else kind
+            raise MemobenchError(
+                f"policy.memory_settings: found {key}={value!r} for memory={name}; expected {expected}"
+            ) from None
     try:
-        return draccus.decode(settings, dict(values))
-    except Exception as error:  # draccus raises errors of its own kinds
-        raise MemobenchError(
-            f"policy.memory_settings={dict(values)} of memory={name} cannot be read: {error.__cause__ or error}"
-        ) from None
-
-
-def _check_type(name: str, key: str, value: Any, kind: Any) -> None:
-    """Refuse values that draccus cannot read as this type, and None or a bool instead of a number."""
-    try:
-        read = draccus.decode(kind, value)
-        fits = isinstance(read, bool) or not isinstance(value, bool)
-    except Exception:
-        fits = False
-    if not fits or (value is None and kind in (bool, int, float, str)):
-        expected = kind.__name__ if isinstance(kind, type) else kind
-        raise MemobenchError(f"policy.memory_settings: found {key}={value!r} for memory={name}; expected {expected}")
+        return settings(**values)
+    except ValueError as error:
+        raise MemobenchError(f"policy.memory_settings of memory={name} cannot be used: {error}") from None

@@ -1,9 +1,9 @@
 """Perceptual-cognitive memory bank (MemoryVLA): the present attends to a bounded list of timed entries.
 
-This is the variant of Dexbotic's MemoryVLA+ with two streams: perceptual, the P tokens of a frame, and cognitive, one
-token. The tokens of a frame retrieve from the entries of their stream, are fused with the result by a gate, and become
-an entry; when the stream is full, its two most similar neighbours are merged. An action chunk reads the present, fused
-in the same way. `docs/guides/memory/bank.md` lists the differences from the source.
+As in Dexbotic's MemoryVLA+, the perceptual stream has the P tokens of a frame, and the cognitive stream one token. A
+frame's tokens retrieve from the entries of their stream, are fused with the result by a gate, and become an entry; a
+full stream merges its two most similar neighbours. An action chunk reads the present, fused in the same way.
+`docs/guides/memory/bank.md` lists the differences from the source.
 """
 
 from __future__ import annotations
@@ -68,7 +68,6 @@ class Bank(MemoryMechanism):
         return {"perceptual": self.reduce(tokens), "cognitive": summary}
 
     def init(self, rows: int) -> State:
-        """Return empty banks."""
         sizes = {"perceptual": (self.spec.tokens, self.reduce.out_features), "cognitive": (1, self.spec.dim)}
         device = self.reduce.weight.device
         state = {name: torch.zeros(rows, self.capacity, *size, device=device) for name, size in sizes.items()}
@@ -76,8 +75,7 @@ class Bank(MemoryMechanism):
         return state | {"count": torch.zeros(rows, dtype=torch.int64, device=device)}
 
     @torch.no_grad()
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Fuse the frame with its retrieval, and append the result as an entry."""
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         count = state["count"]
         written = {"count": (count + 1).clamp(max=self.capacity)}
         for name, present in self._present(tokens).items():
@@ -86,9 +84,8 @@ class Bank(MemoryMechanism):
             written[name], written[f"{name}_steps"] = append(entries, steps, count, fused.float(), step)
         return written
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the present fused with its retrieval: P perceptual tokens and one cognitive token."""
-        assert query is not None
         assert query.tokens is not None
         count, read, shares, steps = state["count"], [], [], []
         now = torch.zeros_like(count)  # used only with an empty bank, which no chunk reads
@@ -96,7 +93,9 @@ class Bank(MemoryMechanism):
         for name, present in self._present(query.tokens).items():
             fused, looked = self.streams[name](present, state[name], state[f"{name}_steps"], count, now)
             read.append(self.out[name](fused))
-            shares.append(shares_of(looked, present.shape[1]))
+            of_all, count_of_all = torch.stack(looked).detach().float(), HEADS * len(looked)
+            share = reduce(of_all, "b r (h n) (l m) -> r n l", "sum", h=HEADS, m=present.shape[1]) / count_of_all
+            shares.append(share[:, :, :-1])  # without the present itself
             steps.append(state[f"{name}_steps"].masked_fill(~real, -1))
         tokens, (perceptual, cognitive) = torch.cat(read, dim=1), shares
         sources = torch.cat([F.pad(perceptual, (0, self.capacity)), F.pad(cognitive, (self.capacity, 0))], dim=1)
@@ -160,13 +159,6 @@ class BankStream(nn.Module):
             looked.append(weights)
         gate = self.gate(torch.cat([present, retrieved], dim=2)).sigmoid()
         return gate * present + (1 - gate) * retrieved, looked
-
-
-def shares_of(looked: list[Tensor], tokens: int) -> Tensor:
-    """Return the share (R, N, L) of each entry in the attention of a stream's blocks and heads; ``tokens`` is N."""
-    of_all = torch.stack(looked).detach().float()
-    shares: Tensor = reduce(of_all, "b r (h n) (l m) -> r n l", "sum", h=HEADS, m=tokens) / (HEADS * len(looked))
-    return shares[:, :, :-1]
 
 
 def waves(steps: Tensor) -> Tensor:

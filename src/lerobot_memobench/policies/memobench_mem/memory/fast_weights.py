@@ -17,12 +17,7 @@ from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Query,
     State,
 )
-from lerobot_memobench.policies.memobench_mem.memory.recurrent import (
-    HIDDEN,
-    RecurrenceSettings,
-    encode_frame,
-    projection,
-)
+from lerobot_memobench.policies.memobench_mem.memory.recurrent import HIDDEN, RecurrenceSettings, projection
 
 HEADS, FRAMES_READ = 2, 8  # frames 16 control steps apart: a chunk reads the last 128 steps directly
 BASE_RATE, MAX_RATE, MAX_STEP = 0.01, 0.1, 5.0
@@ -35,10 +30,8 @@ class FastWeights(MemoryMechanism):
     A frame is one gradient step on |R(k W + b) - (v - k)|^2 / 2, with R an RMS norm whose learned scale and shift the
     step does not change. Each token has its own rate, and the steps of W and of b have a norm of at most 5. Then
     y = R(q W + b) + q, and the token's output is x + LN_post(y) W_o. A chunk reads the outputs of the last 8 frames;
-    earlier frames are kept in W and b only.
-
-    Unlike in the source, W and b are carried over from one remembered frame to the next.
-    `docs/guides/memory/fast_weights.md` lists all differences.
+    earlier frames are kept in W and b only. W and b are carried over from one remembered frame to the next.
+    `docs/guides/memory/fast_weights.md` lists all differences from the source.
     """
 
     Settings = RecurrenceSettings
@@ -65,7 +58,6 @@ class FastWeights(MemoryMechanism):
         self.out = nn.Linear(self.width, spec.width)
 
     def init(self, rows: int) -> State:
-        """Return the learned initial weights, and no frame."""
         outputs = self.bias.new_zeros(rows, FRAMES_READ, self.spec.tokens, self.width)
         return {
             "weight": repeat(self.weight, "... -> r ...", r=rows),
@@ -74,16 +66,12 @@ class FastWeights(MemoryMechanism):
             "steps": torch.full((rows, FRAMES_READ), -1, device=outputs.device),
         }
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Take a gradient step on the frame, apply the weights to it, and drop the oldest frame's output."""
-        frame = encode_frame(self.encoder, tokens, step)
+        frame = self.encoder(tokens, step)
+        layers = (self.query_norm, self.query), (self.key_norm, self.key), (self.value_norm, self.value)
         queries, key, value = (
-            norm(rearrange(linear(frame), "r p (h d) -> r h p d", h=HEADS))
-            for norm, linear in (
-                (self.query_norm, self.query),
-                (self.key_norm, self.key),
-                (self.value_norm, self.value),
-            )
+            norm(rearrange(linear(frame), "r p (h d) -> r h p d", h=HEADS)) for norm, linear in layers
         )
         rate = rearrange(F.softplus(self.rate(frame)).clamp(max=MAX_RATE), "r p h -> r h p 1")
         with torch.autocast(frame.device.type, enabled=False):  # a step is about a hundredth of the weights
@@ -115,8 +103,7 @@ class FastWeights(MemoryMechanism):
         unit = z * root
         return unit * (1 + self.scale) + self.shift, (unit, root)
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the outputs of the last frames."""
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         tokens: Tensor = self.out(state["outputs"].flatten(1, 2))
         steps = repeat(state["steps"], "r f -> r (f p)", p=self.spec.tokens)
         return MemoryTokens(tokens, steps >= 0, steps=steps)

@@ -27,12 +27,7 @@ logger = logging.getLogger(__name__)
 
 
 def sample_frames(step: int, max_frames: int) -> list[int]:
-    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly spaced, with the first and the last.
-
-    Indices are rounded down and strictly increase.
-    """
-    if step < 0 or max_frames < 1:
-        raise ValueError(f"step must be >= 0 and max_frames >= 1, got {step} and {max_frames}")
+    """Choose at most ``max_frames`` of the frames 0 ... ``step``, evenly spaced, with the first and the last."""
     if step < max_frames:
         return list(range(step + 1))
     if max_frames == 1:
@@ -42,18 +37,14 @@ def sample_frames(step: int, max_frames: int) -> list[int]:
 
 @dataclass(eq=False)
 class RememberedFrame:
-    """A remembered frame.
-
-    Attributes:
-        step: control step since the episode began. stored: (P', D') on the CPU, as returned by the encoder.
-        tokens: its memory tokens (P, d_m), kept after the first read; only of objects, whose tokens are small.
-        noise: seed of noise on its memory tokens (``corrupt=noise``); stored objects hold class numbers.
-    """
+    """A remembered frame at a control step, as ``stored`` (P', D') on the CPU by the encoder."""
 
     step: int
     stored: Tensor
     tokens: Tensor | None = None
+    """Its memory tokens (P, d_m), kept after the first read; only of objects, whose tokens are small."""
     noise: int | None = None
+    """Seed of noise on its memory tokens (``corrupt=noise``), because noise would change stored class numbers."""
 
 
 @dataclass
@@ -90,20 +81,16 @@ class FrameSampling(MemoryMechanism):
 
     @classmethod
     def slots(cls, slot: int, settings: FrameSamplingSettings) -> Sequence[int]:
-        """Return the sampled frames."""
         first = max(0, slot + 1 - cls.capacity)
         return [first + chosen for chosen in sample_frames(slot - first, settings.frames)]
 
     def init(self, rows: int) -> State:
-        """Return no frames."""
         return [[] for _ in range(rows)]
 
     def pooled(self, frames: Tensor) -> Tensor:
-        """Return the stored frames, which are pooled when they are read."""
         return frames
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Store the frames."""
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         if not self.warned and any(len(row) == self.capacity for row in state):
             self.warned = True
             logger.warning(
@@ -114,7 +101,7 @@ class FrameSampling(MemoryMechanism):
         new = [RememberedFrame(now, stored) for now, stored in zip(step.tolist(), tokens.to("cpu"), strict=True)]
         return [[*row[1 - self.capacity :], frame] for row, frame in zip(state, new, strict=True)]
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the encoded sampled frames of each row, padded to F."""
         count, device = self.settings.frames, self.encoder.project.weight.device
         rows = [[row[slot] for slot in sample_frames(len(row) - 1, count)] for row in state]
@@ -131,7 +118,6 @@ class FrameSampling(MemoryMechanism):
         return self._tokens(tokens[indices].flatten(1, 2), real, steps[indices])
 
     def _frame_tokens(self, read: list[RememberedFrame], steps: Tensor) -> Tensor:
-        """Return the memory tokens (N, P, d_m) of frames; tokens of objects are computed once per frame."""
         new = [number for number, frame in enumerate(read) if frame.tokens is None]
         cached = [frame.tokens for frame in read]
         if new:
@@ -144,7 +130,6 @@ class FrameSampling(MemoryMechanism):
         return torch.stack(cached)  # type: ignore[arg-type]  # none is None now
 
     def join(self, states: Sequence[State]) -> State:
-        """Concatenate the rows of several states."""
         return [row for state in states for row in state]
 
     def noised(self, state: State, generator: torch.Generator) -> State:
@@ -152,13 +137,12 @@ class FrameSampling(MemoryMechanism):
         seed = generator.initial_seed()
         return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Encode each frame once for all samples that read it."""
         padded = F.pad(histories.places, (0, self.settings.frames - histories.places.shape[1]), value=-1)
         real, places = padded >= 0, padded.clamp(min=0)
         encoded = self._encoded(histories.frames, histories.steps)
-        tokens = self._tokens(encoded, real, histories.steps[places])
-        return tokens._replace(places=places)
+        return self._tokens(encoded, real, histories.steps[places])._replace(places=places)
 
     def _encoded(self, frames: Tensor, steps: Tensor) -> Tensor:
         """Return memory tokens (N, P, d_m) of stored frames (N, P', D') at control steps (N,)."""
@@ -167,7 +151,7 @@ class FrameSampling(MemoryMechanism):
         else:
             tokens = self.pool(frames)
             tokens = tokens if self.settings.content else torch.zeros_like(tokens)
-        encoded: Tensor = self.encoder(tokens.unsqueeze(1), steps[:, None]).squeeze(1)
+        encoded: Tensor = self.encoder(tokens, steps)
         return encoded
 
     def _tokens(self, encoded: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
@@ -193,9 +177,8 @@ def _waves(values: Tensor, base: float) -> Tensor:
 class MemoryEncoder(nn.Module):
     """Map vision tokens and their positions to memory tokens: concat(image, SiLU(Linear(position))) -> Linear.
 
-    A Linear of a concatenation is the sum of Linears of its parts. The 16 tokens of a frame share their time and all
-    frames share their grid, so the first Linear is applied to F times and 4 + 4 places instead of F * 16 tokens.
-    Tokens without a ``grid`` are joined with their time only.
+    A Linear of a concatenation is the sum of Linears of its parts, so the first Linear is applied to F times and 4 + 4
+    places instead of F * 16 tokens. Tokens without a ``grid`` are joined with their time only.
     """
 
     def __init__(self, image_dim: int, memory_dim: int, grid: int = MEMORY_GRID) -> None:
@@ -205,27 +188,22 @@ class MemoryEncoder(nn.Module):
         self.project = nn.Linear(image_dim + self.position.out_features, memory_dim)
 
     def forward(self, tokens: Tensor, steps: Tensor) -> Tensor:
-        """Encode tokens (B, F, P, D) of control steps (B, F) to (B, F, P, d_m) float32."""
+        """Encode tokens (N, P, D) of frames at control steps (N,) to (N, P, d_m)."""
         of_image, of_position = self.project.weight.split([tokens.shape[-1], self.position.out_features], dim=1)
         image = F.linear(tokens.to(of_image.dtype), of_image, self.project.bias)
-        # A training batch holds single frames with many equal steps.
-        alone = steps.shape[1] == 1 and not steps.is_meta
-        at, inverse = steps.unique(return_inverse=True) if alone else (steps, None)
-        positions = F.linear(F.silu(self._positions(at)), of_position)
-        if inverse is not None:
-            positions = positions.index_select(0, inverse.flatten()).unflatten(0, inverse.shape)
-        return image + positions
+        at, of_frame = steps.unique(return_inverse=True)  # many frames of a training batch have equal steps
+        return image + F.linear(F.silu(self._positions(at)), of_position).index_select(0, of_frame)
 
     def _positions(self, steps: Tensor) -> Tensor:
         """Return `position` of each token, (..., 16, 768); without a grid, of the frame's time only, (..., 1, d_m).
 
-        Its input is sin t, cos t, sin y, cos y, sin x, cos x, at 128 frequencies each from 1 down to 1/base. The middle
-        of token i of a grid row lies at 4 i + 2 of the 16 patches; y runs over rows.
+        Its input is sin t, cos t, sin y, cos y, sin x, cos x, at 128 frequencies each; y runs over rows.
         """
         weight = self.position.weight
         if not self.grid:
             return rearrange(self.position(_waves(steps, _TIME_BASE).to(weight.dtype)), "... d -> ... 1 d")
         of_time, of_row, of_column = weight.split(2 * _FREQUENCIES, dim=1)
+        # The middle of token i of a grid row lies at 4 i + 2 of the 16 patches.
         middles = 4.0 * torch.arange(MEMORY_GRID, dtype=torch.float32, device=steps.device) + 2.0
         grid = _waves(middles, _SPACE_BASE).to(weight.dtype)
         time = F.linear(_waves(steps, _TIME_BASE).to(weight.dtype), of_time, self.position.bias)

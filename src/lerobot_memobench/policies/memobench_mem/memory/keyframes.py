@@ -96,7 +96,6 @@ class Keyframes(MemoryMechanism):
     # -- a rollout ---------------------------------------------------------------------------------------------------
 
     def init(self, rows: int) -> State:
-        """Return no frames and the empty text."""
         like = self.ask
         frame = rows, RECENT + NOMINATED, self.spec.tokens, self.spec.dim
         return {
@@ -106,9 +105,8 @@ class Keyframes(MemoryMechanism):
             "text": torch.full((rows,), self.count, device=like.device),
         }
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Keep the frame, run the high level, and count its nominations."""
-        assert query is not None
         assert query.choices is not None
         keyframes, old = state["frames"][:, :NOMINATED], state["frames"][:, NOMINATED:]
         keyframe_at, old_at = state["steps"][:, :NOMINATED], state["steps"][:, NOMINATED:]
@@ -145,15 +143,14 @@ class Keyframes(MemoryMechanism):
         rows = torch.arange(len(keyframes), device=keyframes.device).unsqueeze(1)
         return keyframes[rows, chosen.clamp(min=0)], chosen >= 0
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the words of the text that the high level chose last."""
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         return MemoryTokens(*self.texts(state["text"]))
 
     # -- a training --------------------------------------------------------------------------------------------------
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Run the high level once per sample with true keyframes; without labels, replay a rollout."""
-        if histories.subgoals is None or query is None or query.subgoal is None:
+        if histories.subgoals is None or query.subgoal is None:
             return super().replay(histories, query)
         assert query.choices is not None
         labels = F.pad(histories.subgoals, (0, 1), value=-1)[histories.places]
@@ -197,6 +194,5 @@ class Keyframes(MemoryMechanism):
         return slots, ends.gather(1, recent.clamp(min=0)) & (recent >= 0)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the losses of the last replay with labels, for the checkpoint and for the keyframes."""
         losses, self._losses = self._losses, {}
         return losses

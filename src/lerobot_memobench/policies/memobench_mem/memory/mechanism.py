@@ -1,9 +1,8 @@
 """Interface of memory mechanisms: how to keep an episode, how to read it, and how training replays it.
 
-A mechanism is a module with its own weights. In a rollout each row has a state: `write` updates it once per remembered
-frame, and `read` turns it into memory tokens once per action chunk. In training `replay` computes the same for the
-samples of a batch, from the frames that a rollout would have written; gradients pass through a bounded number of the
-last frames.
+In a rollout each row has a state: `write` updates it once per remembered frame, and `read` turns it into memory tokens
+once per action chunk. In training `replay` computes the same for the samples of a batch, from the frames that a rollout
+would have written; gradients pass through a bounded number of the last frames.
 
 Shapes: B samples, R rows, U different frames, F frames of a sample's history, P tokens per frame, D their width, d_m
 width of memory tokens, L memory tokens of a row.
@@ -39,8 +38,7 @@ class Histories(NamedTuple):
     """Remembered frames of B samples; frames shared by several samples are stored once.
 
     Attributes:
-        frames: (U, P, D') stored frames: P tokens of width D' each, before pooling.
-        steps: (U,) their control steps since their episodes began, int64.
+        frames: (U, P, D'), as stored, before pooling. steps: (U,) int64, control steps since their episodes began.
         places: (B, F) indices of each sample's frames, oldest first, padded by -1.
         subgoals: (U,) index of each frame's subgoal text, -1: none; with `MemoryMechanism.privileged`.
         ahead: (B, n) indices of the frames that follow, -1 after the episode's end; with `MemoryMechanism.ahead`.
@@ -55,7 +53,6 @@ class Histories(NamedTuple):
     exact: Tensor | None = None
 
     def to(self, device: torch.device) -> Histories:
-        """Move all tensors to a device."""
         return Histories(*(None if part is None else part.to(device) for part in self))  # type: ignore[arg-type]
 
 
@@ -73,7 +70,6 @@ class Query(NamedTuple):
     subgoal: Tensor | None = None
 
     def rows(self, chosen: Any) -> Query:
-        """Select rows."""
         return Query(*(None if part is None else part[chosen] for part in self))
 
 
@@ -98,7 +94,6 @@ class MemoryTokens(NamedTuple):
     query: Query | None = None
 
     def map(self, module: Callable[[Tensor], Tensor]) -> MemoryTokens:
-        """Apply a module to each token."""
         return self._replace(each=module(self.each))
 
     def rows(self) -> Tensor:
@@ -117,28 +112,20 @@ State = Any
 
 @dataclass(frozen=True)
 class MemorySpec:
-    """Dimensions for which a mechanism is built.
+    """Dimensions for which a mechanism is built."""
 
-    Attributes:
-        dim: D, width of a frame's tokens. tokens: P, their number. width: d_m, of memory tokens.
-        expert: width of the action expert.
-        grid: side of the square of an image's tokens; 0 if tokens have no place in an image.
-        stride: control steps between written frames.
-        subgoals: texts of the checkpoints; with `MemoryMechanism.privileged`.
-    """
-
-    dim: int
-    tokens: int
-    width: int
-    expert: int
-    grid: int
-    stride: int
-    subgoals: tuple[str, ...] = ()
+    dim: int  # D, width of a frame's tokens
+    tokens: int  # P, their number
+    width: int  # d_m, of memory tokens
+    expert: int  # width of the action expert
+    grid: int  # side of the square of an image's tokens; 0 if tokens have no place in an image
+    stride: int  # control steps between written frames
+    subgoals: tuple[str, ...] = ()  # texts of the checkpoints; with `MemoryMechanism.privileged`
 
 
 @dataclass
 class NoSettings:
-    """Settings of a mechanism without settings."""
+    """A mechanism has no settings."""
 
 
 class MemoryMechanism(nn.Module, ABC):
@@ -152,7 +139,7 @@ class MemoryMechanism(nn.Module, ABC):
             is a thumbnail.
         ahead: number of following frames that training loads as labels.
         privileged: whether it learns from texts of checkpoints. A rollout gets the texts of its task, in no order.
-        fusion: its own `fusion.MemoryFusion` (``policy.memory_fusion=own``); None: any general one.
+        fusion: its own `fusion.MemoryPass` (``policy.memory_fusion=own``); None: any general one.
         gradient_frames: maximum number of last frames through which gradients pass.
         per_frame: whether memory tokens are P of each frame read, oldest first, as ``align=framewise`` needs.
         reads_text: whether memory tokens are words of a checkpoint's text; then no alignment is possible.
@@ -189,33 +176,28 @@ class MemoryMechanism(nn.Module, ABC):
         """Return the initial state of rows."""
 
     @abstractmethod
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Return the state after each row's next frame, without changing ``state``.
 
-        Args:
-            tokens: (R, P, D) of the frame, as of `pooled`. step: (R,) control step since the episode began.
-            query: choices of the rows.
+        ``tokens`` (R, P, D) are those of the frame, as of `pooled`; ``step`` (R,) counts since the episode began;
+        ``query`` holds choices only.
         """
 
     @abstractmethod
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         """Return the tokens that a chunk reads, (R, L, d_m), with the same L for all states."""
 
-    def observe(self, state: State, frames: Tensor, step: Tensor, query: Query | None = None) -> State:
+    def observe(self, state: State, frames: Tensor, step: Tensor, query: Query = Query()) -> State:
         """Return the state after each row's next stored frame (R, P', D')."""
         return self.write(state, self.pooled(frames), step, query)
 
     def pooled(self, frames: Tensor) -> Tensor:
-        """Return the tokens (N, P, D) of stored frames (N, P', D'), at least in the precision of the weights.
-
-        Frames of images are stored in bfloat16; weights are float32 in training and usually in a rollout.
-        """
-        tokens: Tensor = self.pool(frames)
+        """Return the tokens (N, P, D) of stored frames (N, P', D'), at least in the precision of the weights."""
+        tokens: Tensor = self.pool(frames)  # images are stored in bfloat16
         own = next((parameter for name, parameter in self.named_parameters() if not name.startswith("pool.")), tokens)
         return tokens.to(torch.promote_types(tokens.dtype, own.dtype))
 
     def join(self, states: Sequence[State]) -> State:
-        """Concatenate the rows of several states."""
         return {name: torch.cat([state[name] for state in states]) for name in states[0]}
 
     def noised(self, state: State, generator: torch.Generator) -> State:
@@ -230,11 +212,11 @@ class MemoryMechanism(nn.Module, ABC):
         """Return which of an episode's frames 0 ... ``slot`` training loads to read at the last; by default all."""
         return range(slot + 1)
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Return what B samples read, equal to rollouts that wrote the same frames.
 
         All but the last `gradient_frames` of each sample are written without gradients, once for all samples of an
-        episode. Histories must begin at the same frame for all samples of an episode.
+        episode, whose histories must begin at the same frame.
         """
         count = (histories.places >= 0).sum(dim=1)
         begin = (count - self.gradient_frames).clamp(min=0)
@@ -243,15 +225,18 @@ class MemoryMechanism(nn.Module, ABC):
         if self.gradient_frames:
             fresh = self.init(len(begin))  # with gradients, for samples without earlier frames
             early = begin == 0
-            state = {name: torch.where(_like(early, of), fresh[name], of) for name, of in state.items()}
+            state = {
+                name: torch.where(early.reshape(-1, *[1] * (of.ndim - 1)), fresh[name], of)
+                for name, of in state.items()
+            }
             left = count - begin
             ahead = begin[:, None] + torch.arange(int(left.max()), device=begin.device)
             places = histories.places.gather(1, ahead.clamp(max=histories.places.shape[1] - 1))
             state = self._written(state, histories, places, query, left, torch.arange(len(left), device=left.device))
         return self.read(state, query)
 
-    def _state_before(self, histories: Histories, begin: Tensor, query: Query | None) -> State:
-        """Return the states of B samples, each after the first ``begin`` (B,) frames of its history.
+    def _state_before(self, histories: Histories, begin: Tensor, query: Query) -> State:
+        """Return the states of B samples after the first ``begin`` (B,) frames of their histories.
 
         Each episode is written once, up to its latest sample.
         """
@@ -266,23 +251,22 @@ class MemoryMechanism(nn.Module, ABC):
                 f"{type(self).__name__}.slots returns different sequences for samples of one episode with the same "
                 "first frame; the default replay needs prefixes of one sequence, so define your own replay"
             )
-        own = None if query is None else query.rows(latest)
-        return self._written(self.init(len(first)), histories, histories.places[latest], own, begin, episode)
+        places, own = histories.places[latest], query.rows(latest)
+        return self._written(self.init(len(first)), histories, places, own, begin, episode)
 
     def _written(
-        self, state: State, histories: Histories, places: Tensor, query: Query | None, stops: Tensor, row_of: Tensor
+        self, state: State, histories: Histories, places: Tensor, query: Query, stops: Tensor, row_of: Tensor
     ) -> State:
         """Write the frames of R rows, ``places`` (R, T); return the states of B samples on the way.
 
-        Args:
-            stops: (B,) number of frames after which a sample's state is taken. row_of: (B,) its row.
+        A sample's state is that of row ``row_of`` (B,) after ``stops`` (B,) frames.
         """
         counts = torch.zeros_like(places[:, 0]).scatter_reduce(0, row_of, stops, "amax")
         order = counts.argsort(descending=True, stable=True)  # finished rows are dropped from the end
         state, row_of, ends = _rows(state, order), order.argsort()[row_of], counts[order].tolist()
         needed, where = places[order].clamp(min=0).unique(return_inverse=True)
         pooled, steps = self.pooled(histories.frames[needed]), histories.steps[needed]
-        query, states, samples = None if query is None else query.rows(order), [], []
+        query, states, samples = query.rows(order), [], []
         for time in range(ends[0] + 1):
             samples.append((stops == time).nonzero().flatten())
             if len(samples[-1]):
@@ -290,8 +274,8 @@ class MemoryMechanism(nn.Module, ABC):
             going = sum(end > time for end in ends)
             state = _rows(state, slice(going))
             if going:
-                now, part = where[:going, time], None if query is None else query.rows(slice(going))
-                state = self.write(state, pooled[now], steps[now], part)
+                now = where[:going, time]
+                state = self.write(state, pooled[now], steps[now], query.rows(slice(going)))
         return _rows(self.join(states), torch.cat(samples).argsort())
 
     # -- losses -------------------------------------------------------------------------------------
@@ -299,8 +283,7 @@ class MemoryMechanism(nn.Module, ABC):
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the mechanism's own losses by name, (B,) each and weighted; called after `replay` and the actions.
 
-        When a loss is only measured, a privileged memory replays the histories with labels, and then without them, so
-        that the actions follow its own choice. ``batch`` also holds `MemoryPass.outputs` of its fusion.
+        ``batch`` also holds `MemoryPass.outputs` of its fusion.
         """
         return {}
 
@@ -315,8 +298,3 @@ def with_noise(values: Tensor, generator: torch.Generator) -> Tensor:
 
 def _rows(state: dict[str, Tensor], chosen: Any) -> dict[str, Tensor]:
     return {name: tensor[chosen] for name, tensor in state.items()}
-
-
-def _like(rows: Tensor, other: Tensor) -> Tensor:
-    """Reshape ``rows`` (R,) to the number of dimensions of another tensor (R, ...)."""
-    return rows.reshape(-1, *[1] * (other.ndim - 1))

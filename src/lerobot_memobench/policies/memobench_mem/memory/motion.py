@@ -23,7 +23,7 @@ from einops import rearrange, reduce, repeat
 from torch import Tensor, nn
 
 from lerobot_memobench.policies.memobench_mem.encoders import THUMBNAIL
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import (
     Histories,
     MemoryMechanism,
@@ -69,43 +69,32 @@ class MotionExpert(nn.Module):
 
 
 class ForesightPass(MemoryPass):
-    """A pass with hindsight in the condition of the expert's norms, and motion queries before the actions."""
+    """A pass with hindsight in the condition of the expert's norms, and motion queries before the actions.
 
-    def __init__(self, expert: MotionExpert, memory: MemoryTokens) -> None:
-        super().__init__()
-        self.expert, self.hindsight = expert, expert.condition(memory.rows().squeeze(1))
-
-    def actions(self, tokens: Tensor) -> Tensor:
-        """Insert the queries before the actions; queries and actions attend to each other."""
-        queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
-        return torch.cat([queries, tokens], dim=1)
-
-    def condition(self, condition: Tensor) -> Tensor:
-        """Add hindsight."""
-        hindsight: Tensor = self.hindsight
-        return condition + hindsight
-
-    def expert_states(self, states: Tensor) -> None:
-        """Decode the motion (B, n, C k) that the queries predict."""
-        self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
-
-
-class Foresight(MemoryFusion):
-    """Add hindsight to the condition of the expert's norms, and insert motion queries before the actions.
-
-    The actions' positions are therefore shifted by `FORESIGHT` from those of plain pi0.5.
+    Queries and actions attend to each other. The queries shift the actions' positions by `FORESIGHT`.
     """
 
     parts = ("foresight.",)
 
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        super().__init__(model, memory_dim, expert_dim)
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
         pool = model.memory.pool
         model.foresight = MotionExpert(memory_dim, expert_dim, pool.cells * pool.moved)
 
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass conditioned on this memory."""
-        return ForesightPass(self.model.foresight, memory)
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
+        self.expert: MotionExpert = model.foresight
+        self.hindsight: Tensor = self.expert.condition(memory.rows().squeeze(1))
+
+    def actions(self, tokens: Tensor) -> Tensor:
+        queries = repeat(self.expert.queries.to(tokens.dtype), "n w -> b n w", b=len(tokens))
+        return torch.cat([queries, tokens], dim=1)
+
+    def condition(self, condition: Tensor) -> Tensor:
+        return condition + self.hindsight
+
+    def expert_states(self, states: Tensor) -> None:
+        self.outputs[FORESEEN] = self.expert.decode(states[:, :FORESIGHT].to(torch.float32))
 
 
 # -- hindsight --------------------------------------------------------------------------------------------------------
@@ -118,7 +107,7 @@ class Motion(MemoryMechanism):
     thumbnail. With fewer motions the earliest is repeated; at an episode's first frame the motion is zero.
     """
 
-    fusion = Foresight
+    fusion = ForesightPass
     stride = {"objects": 1, "pixels": 4}
     asks_motion = True
     ahead = FORESIGHT
@@ -135,23 +124,19 @@ class Motion(MemoryMechanism):
 
     @classmethod
     def make_pool(cls, observations: Any, spec: MemorySpec) -> MotionField:
-        """Return the motion field for the stored frames of an encoder."""
         if isinstance(observations, ObjectEncoder):
             return ObjectMotion(observations.order, observations.kinds, spec.expert, HINDSIGHT)
         return ImageMotion(spec.expert, HINDSIGHT)
 
     @property
     def field(self) -> MotionField:
-        """The motion field between two stored frames."""
         return cast(MotionField, self.pool)
 
     @classmethod
     def slots(cls, slot: int, settings: NoSettings) -> Sequence[int]:
-        """Return the last frames, between which the motions are."""
         return range(max(0, slot - HINDSIGHT), slot + 1)
 
     def init(self, rows: int) -> dict[str, Tensor]:
-        """Return zero motion, and no last frame."""
         like, field = self.summary, self.field
         return {
             "frame": like.new_zeros(rows, 1, field.size),
@@ -160,11 +145,9 @@ class Motion(MemoryMechanism):
         }
 
     def pooled(self, frames: Tensor) -> Tensor:
-        """Return the stored frames: motion is found between them."""
-        return frames
+        return frames  # motion is found between stored frames
 
-    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query | None = None) -> dict[str, Tensor]:
-        """Append the motion to stored frames."""
+    def write(self, state: Any, tokens: Tensor, step: Tensor, query: Query = Query()) -> dict[str, Tensor]:
         count, motions = state["frames"], state["motions"]
         moved = self.field.between(state["frame"].to(tokens.dtype), tokens).to(motions.dtype).unsqueeze(1)
         first, second = (rearrange(count == number, "r -> r 1 1 1") for number in (0, 1))
@@ -173,14 +156,12 @@ class Motion(MemoryMechanism):
         return {"frame": tokens.to(state["frame"].dtype), "motions": motions, "frames": (count + 1).clamp(max=2)}
 
     def noised(self, state: Any, generator: torch.Generator) -> dict[str, Tensor]:
-        """Return the state with noise on its motions, not on the last frame."""
-        return {**state, "motions": with_noise(state["motions"], generator)}
+        return {**state, "motions": with_noise(state["motions"], generator)}  # not the last frame
 
-    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Encode the motions to one token."""
+    def read(self, state: Any, query: Query = Query()) -> MemoryTokens:
         return self._encoded(state["motions"])
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         """Compute the motions of all samples at once, and the following motions as labels."""
         frames, places, field = histories.frames, histories.places, self.field
         exact = frames if histories.exact is None else histories.exact
@@ -224,7 +205,7 @@ class Motion(MemoryMechanism):
 class MotionField(nn.Module, ABC):
     """Motion between two stored frames of D' numbers (``size``), and tokens of it, whose layers are trained.
 
-    There are C ``cells``, of K ``numbers`` each; the first ``moved`` are motion.
+    There are C ``cells`` of K ``numbers``; the first ``moved`` of these are motion.
     """
 
     size: int
@@ -306,7 +287,6 @@ class ImageMotion(MotionField):
         self.places = nn.Parameter(torch.randn(side**2, width) * 0.02)
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
-        """Match the blocks of thumbnails."""
         earlier, later = (frames.to(torch.float32).reshape(-1, THUMBNAIL, THUMBNAIL) for frames in (before, now))
         return match_blocks(earlier, later).flatten(1, 2)
 
@@ -336,8 +316,8 @@ MOVED = 4
 class ObjectMotion(MotionField):
     """Displacement of each slot's thing and of the hand; one token per pair of frames, pooled by learned attention.
 
-    A cell's numbers are its motion, whether it is known, its class, and its place. The hand has class ``kinds``.
-    ``order`` and ``kinds`` are as of `objects.SlotEncoder`.
+    A cell's numbers are its motion, whether it is known, its class (``kinds`` for the hand), and its place. ``order``
+    and ``kinds`` are as of `objects.SlotEncoder`.
     """
 
     size, cells, numbers, moved = SIZE + HAND_DIM + 1, SLOTS + 1, MOVED + 5, MOVED
@@ -399,7 +379,6 @@ class ObjectMotion(MotionField):
         return moved, knowns
 
     def tokens(self, fields: Tensor) -> Tensor:
-        """Return a token per pair of frames."""
         moved, known, kind, position = fields.split([MOVED, 1, 1, 3], dim=-1)
         kinds = torch.tensor(self.order, device=fields.device)[kind.squeeze(-1).long()]
         features = self.mlp(torch.cat([moved, position, self.kind(kinds)], dim=-1))

@@ -54,10 +54,8 @@ class Recurrent(MemoryMechanism):
     """RMT of RoboMME's pi0.5: slots attend to the frame and to themselves, with a norm after the residual.
 
     For a frame X and slots S: Z = LN_pre([X; S]); O is softmax attention of the slots' rows of Z to all of Z, with
-    rotary positions along [X; S] and one key-value head; S <- LN_post(O W_o + S). One layer, no feed-forward.
-
-    Unlike in the source, slots are carried over from one remembered frame to the next.
-    `docs/guides/memory/recurrent.md` lists all differences.
+    rotary positions along [X; S] and one key-value head; S <- LN_post(O W_o + S). Slots are carried over from one
+    remembered frame to the next. `docs/guides/memory/recurrent.md` lists all differences from the source.
     """
 
     Settings = RecurrentSettings
@@ -77,13 +75,11 @@ class Recurrent(MemoryMechanism):
         self.out = nn.Linear(width, spec.width)
 
     def init(self, rows: int) -> State:
-        """Return the learned initial slots of each row."""
         return {"slots": repeat(self.initial, "s d -> r s d", r=rows)}
 
-    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query | None = None) -> State:
-        """Let the slots attend to the frame and to themselves."""
+    def write(self, state: State, tokens: Tensor, step: Tensor, query: Query = Query()) -> State:
         slots: Tensor = state["slots"]
-        frame = encode_frame(self.encoder, tokens, step)
+        frame = self.encoder(tokens, step)
         count, length = slots.shape[1], frame.shape[1] + slots.shape[1]
         both = self.pre_norm(torch.cat([frame, slots], dim=1))
         key, value = self.key_value(both).chunk(2, dim=-1)
@@ -94,8 +90,7 @@ class Recurrent(MemoryMechanism):
         read = rearrange(weights @ value, "r (h s) d -> r s (h d)", h=HEADS)
         return {"slots": self.post_norm(self.attended(read) + slots)}
 
-    def read(self, state: State, query: Query | None = None) -> MemoryTokens:
-        """Return the slots at the width of memory tokens."""
+    def read(self, state: State, query: Query = Query()) -> MemoryTokens:
         tokens: Tensor = self.out(state["slots"])
         return MemoryTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device))
 
@@ -105,9 +100,3 @@ def projection(inputs: int, outputs: int, std: float = 0.02) -> nn.Linear:
     linear = nn.Linear(inputs, outputs, bias=False)
     nn.init.normal_(linear.weight, std=std)
     return linear
-
-
-def encode_frame(encoder: MemoryEncoder, tokens: Tensor, step: Tensor) -> Tensor:
-    """Encode a frame's tokens (R, P, D) with their places and its control step (R,): (R, P, d)."""
-    encoded: Tensor = encoder(tokens.unsqueeze(1), step.unsqueeze(1)).squeeze(1)
-    return encoded

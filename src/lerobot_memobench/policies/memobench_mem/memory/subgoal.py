@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from einops import repeat
 from torch import Tensor, nn
 
-from lerobot_memobench.policies.memobench_mem.fusion import MemoryFusion, MemoryPass, Prefix
+from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass, Prefix
 from lerobot_memobench.policies.memobench_mem.memory.frames import FrameSampling
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import SUBGOAL, Histories, MemoryTokens, Query
 
@@ -63,7 +63,7 @@ def scored(scores: Tensor, choices: Tensor) -> Tensor:
 
 
 class SubgoalChoice(nn.Module):
-    """Modules that the narrow channel adds: a last token of the prefix, whose last state is scored, and the texts."""
+    """A last token of the prefix, whose last state is scored, and the texts."""
 
     def __init__(self, texts: tuple[str, ...], width: int) -> None:
         super().__init__()
@@ -84,30 +84,38 @@ class NarrowPass(MemoryPass):
 
     The state's own token attends to the whole prefix, so reading it would open a second channel; hence the copy. If
     the prompt spells the state, there is no copy. The condition of the expert's norms comes from the text instead of
-    the instruction.
-
-    In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen`` (B,), S: none).
+    the instruction. In training the text is the true one; otherwise a pass over the prefix chooses it (``chosen``
+    (B,), S: none).
     """
 
+    parts = ("subgoal.",)
     watches = ("prefix",)
 
-    def __init__(self, model: Any, memory: MemoryTokens, watched: bool) -> None:
-        super().__init__(watched)
+    @classmethod
+    def extend(cls, model: Any, memory_dim: int, expert_dim: int) -> None:
+        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
+
+    def __init__(self, model: Any, memory: MemoryTokens, watched: bool = False) -> None:
+        super().__init__(model, memory, watched)
         assert memory.query is not None
-        self.model, self.memory, self.query = model, memory, memory.query
+        self.memory, self.query = memory, memory.query
         self.choice: SubgoalChoice = model.subgoal
         self.chosen: Tensor | None = None
 
     def prefix(self, prefix: Prefix, state: int | None = None) -> Prefix:
-        """Append the memory, the text and the copy of the state."""
         memory, true = self.memory, self.query.subgoal
         own = prefix.tokens[:, : 0 if state is None else state + 1][:, -1:]
         ask = repeat(self.choice.ask, "1 1 d -> b 1 d", b=len(own))
         prefix = prefix.joined(memory.rows(), memory.mask).joined(ask, memory.mask.new_ones(len(own), 1))
         unread, none = prefix.tokens.shape[1], self.choice.score.out_features
         prefix = prefix._replace(asked=slice(unread - 1, unread))
-        chosen = self.chosen = self._chosen(prefix) if true is None else torch.where(true < 0, none, true)
-        text, of_text = self.choice.texts(chosen)
+        if true is None:
+            with torch.no_grad():
+                self.model.read_prefix(prefix, self)
+                self.chosen = self.outputs[SCORES].argmax(dim=1)
+        else:
+            self.chosen = torch.where(true < 0, none, true)
+        text, of_text = self.choice.texts(self.chosen)
         if self.model.instruction is not None:
             prefix = prefix._replace(instruction=self.model.instruction(text, of_text))
         whole = prefix.joined(text, of_text).joined(own, of_text.new_ones(own.shape[:2]))
@@ -125,13 +133,7 @@ class NarrowPass(MemoryPass):
         seen = torch.where(of_query == 2, of_key == 2, of_key <= of_query)
         return seen.expand(len(prefix.tokens), -1, -1)
 
-    @torch.no_grad()
-    def _chosen(self, prefix: Prefix) -> Tensor:
-        self.model.read_prefix(prefix, self)
-        return self.outputs[SCORES].argmax(dim=1)
-
     def read_out(self, states: Tensor) -> None:
-        """Score the texts by the last state of ``ask``: (B, S + 1)."""
         assert self.query.choices is not None
         score = self.choice.score
         self.outputs[SCORES] = scored(score(states[:, 0].to(score.weight.dtype)), self.query.choices)
@@ -149,21 +151,6 @@ class NarrowPass(MemoryPass):
         return shares
 
 
-class NarrowChannel(MemoryFusion):
-    """Choose a text by prefix and memory; actions read only this text (`NarrowPass`)."""
-
-    reports_reads = True
-    parts = ("subgoal.",)
-
-    def __init__(self, model: Any, memory_dim: int, expert_dim: int) -> None:
-        super().__init__(model, memory_dim, expert_dim)
-        model.subgoal = SubgoalChoice(model.memory.spec.subgoals, memory_dim)
-
-    def begin(self, memory: MemoryTokens, watched: bool = False) -> MemoryPass:
-        """Begin a pass over this memory; its ``query`` holds the texts to choose from."""
-        return NarrowPass(self.model, memory, watched)
-
-
 class Subgoal(FrameSampling):
     """SimpleMemVLA on this backbone: 32 frames in the prefix, and an expert that reads only the chosen text.
 
@@ -173,14 +160,12 @@ class Subgoal(FrameSampling):
     """
 
     privileged = True
-    fusion = NarrowChannel
+    fusion = NarrowPass
 
-    def read(self, state: Any, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and pass on the texts to choose from."""
+    def read(self, state: Any, query: Query = Query()) -> MemoryTokens:
         return super().read(state, query)._replace(query=query)
 
-    def replay(self, histories: Histories, query: Query | None = None) -> MemoryTokens:
-        """Read the frames, and pass on the texts to choose from and the true text."""
+    def replay(self, histories: Histories, query: Query = Query()) -> MemoryTokens:
         return super().replay(histories, query)._replace(query=query)
 
     def losses(self, batch: Mapping[str, Tensor]) -> dict[str, Tensor]:

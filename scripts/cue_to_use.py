@@ -1,9 +1,9 @@
-"""Measure the gap of each checkpoint: control steps from the cue to its use, in episodes of the scripted expert.
+"""Measure the control steps from the cue of each checkpoint to its use, in episodes of the scripted expert.
 
-    python scripts/gaps.py --episodes 3 --log outputs/gaps.jsonl
+    python scripts/cue_to_use.py --episodes 3 --log outputs/cue_to_use.jsonl
 
 runs the expert on all tasks without rendering, appends one line per episode to the log (the same command continues an
-interrupted run) and writes ``src/lerobot_memobench/tasks/gaps.json``. ``docs/benchmark/gap.md`` defines the gap.
+interrupted run) and writes ``src/lerobot_memobench/tasks/cue_to_use.json``. ``docs/benchmark/gap.md`` defines them.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 from lerobot_memobench.constants import DEMONSTRATION_SEED, PROMPT
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.io import write_file
-from lerobot_memobench.tasks.catalogue import get_task, task_names
+from lerobot_memobench.tasks.catalogue import CUE_TO_USE_FILE, cue_in_prompt, get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, atoms
-from lerobot_memobench.tasks.gap import GAPS_FILE, cue_in_prompt
 from lerobot_memobench.tasks.progress import Progress
 from lerobot_memobench.tasks.task import Task
 
@@ -30,11 +29,8 @@ VISIBLE = 0.002
 HOME = Atom("handhome", ())
 
 
-def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
-    """Run the expert on one episode; return its success and the gap of each checkpoint, without held steps.
-
-    A gap is None if the checkpoint was not reached or nothing before it has to be remembered.
-    """
+def cue_to_use_of(task: Task, seed: int) -> tuple[bool, list[int | None]]:
+    """Return success and the cue-to-use times of checkpoints without held steps; None: not reached, or no cue."""
     episode = Episode(task, referent="random")
     episode.reset(seed)
     cues = _prompt_cues(episode)
@@ -46,19 +42,19 @@ def episode_gaps(task: Task, seed: int) -> tuple[bool, list[int | None]]:
             continue
         scenes.append(_scene(episode))
         homes.append(episode.sim.holds(HOME))
-    gaps: list[int | None] = []
+    steps: list[int | None] = []
     before = 0
     for k, reached in enumerate(episode.progress.ordered_step):
         if reached is None:
-            gaps.append(None)
+            steps.append(None)
             continue
         use = max([before, *(step for step in range(before, reached) if homes[step])])
         if cue_in_prompt(episode.task, k):
-            gaps.append(start + use - cues[k])
+            steps.append(start + use - cues[k])
         else:  # at first the instruction is enough, even where LIBERO's scene still moves by itself
-            gaps.append(_since_change(scenes[: use + 1]) if k else None)
+            steps.append(_since_change(scenes[: use + 1]) if k else None)
         before = reached
-    return episode.success, gaps
+    return episode.success, steps
 
 
 def _prompt_cues(episode: Episode) -> list[int]:
@@ -82,36 +78,35 @@ def _prompt_cues(episode: Episode) -> list[int]:
 
 
 def _scene(episode: Episode) -> NDArray[np.float64]:
-    """Return the positions of all joints, m or rad, and objects, m."""
     sim = episode.sim
     joints = [sim.world.articulation(name)[1] for name in sorted(sim.world.joints)]
     return np.array([*joints, *(x for name in episode.task.objects for x in sim.body_pose(name)[0])])
 
 
 def _since_change(scenes: list[NDArray[np.float64]]) -> int | None:
-    """Return the steps since the scene last differed visibly from the last one; None if it never did."""
+    """Return the number of steps since the scene last differed visibly from the last one; None if it never did."""
     differs = np.abs(np.array(scenes) - scenes[-1]).max(axis=1) > VISIBLE
     return int(len(scenes) - 1 - np.flatnonzero(differs)[-1]) if differs.any() else None
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, list[list[int] | None]]:
-    """Return task -> for each checkpoint the least, median and largest gap, None for a checkpoint without one."""
+    """Return task -> for each checkpoint the least, median and largest number of steps; None for one without a cue."""
     found: dict[str, list[list[int] | None]] = {}
     for name in task_names(suite=None):
-        episodes = [line["gaps"] for line in lines if line["task"] == name and line["success"]]
-        columns = [[gap for gap in column if gap is not None] for column in zip(*episodes, strict=True)]
+        episodes = [line["cue_to_use"] for line in lines if line["task"] == name and line["success"]]
+        columns = [[steps for steps in column if steps is not None] for column in zip(*episodes, strict=True)]
         found[name] = [[min(c), int(np.median(c)), max(c)] if c else None for c in columns]
     return found
 
 
 def main(
     log: Annotated[Path, typer.Option(help="Log of the episodes; the same command continues it.")] = Path(
-        "outputs/gaps.jsonl"
+        "outputs/cue_to_use.jsonl"
     ),
     episodes: Annotated[int, typer.Option(min=1, help="Episodes of each task.")] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the first episode.")] = DEMONSTRATION_SEED,
 ) -> None:
-    """Measure the gaps and write the shipped file."""
+    """Measure all tasks and write the shipped file."""
     log.parent.mkdir(parents=True, exist_ok=True)
     lines = [json.loads(line) for line in log.read_text().splitlines()] if log.is_file() else []
     done = {(line["task"], line["seed"]) for line in lines}
@@ -119,12 +114,12 @@ def main(
         for name in task_names(suite=None):
             if (name, number) in done:
                 continue
-            success, gaps = episode_gaps(get_task(name), number)
-            lines.append({"task": name, "seed": number, "success": success, "gaps": gaps})
+            success, steps = cue_to_use_of(get_task(name), number)
+            lines.append({"task": name, "seed": number, "success": success, "cue_to_use": steps})
             with log.open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")
     rows = [f"{json.dumps(name)}: {json.dumps(row)}" for name, row in summary(lines).items()]
-    write_file(GAPS_FILE, "{\n" + ",\n".join(rows) + "\n}\n")
+    write_file(CUE_TO_USE_FILE, "{\n" + ",\n".join(rows) + "\n}\n")
 
 
 if __name__ == "__main__":
