@@ -144,7 +144,7 @@ def test_bad_settings_are_refused_before_anything_is_written(words: list[str], n
 
 
 def test_without_the_assets_nothing_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "places", lambda: [])
+    monkeypatch.setattr(files, "find_assets", lambda: (None, ""))
     with pytest.raises(MemobenchError, match="LIBERO's assets"):
         plan_line([*LINE, "output_dir=out"])
 
