@@ -18,9 +18,9 @@ hold ~ logs ~ difficulty=hard ~ self._held = steps + -( ~ self._held = steps + 1
 cameras ~ starts ~ turn_it_off-v0 ~ "agentview": AGENTVIEW, "wrist": robot ~ "wrist": AGENTVIEW, "agentview": robot
 predicate ~ executions ~ published 24 ~ return self.touching(a, b) ~ return True
 normalisation ~ weights ~ objects none ~ "STATE": mode, ~ "STATE": NormalizationMode.IDENTITY,
-loss ~ weights ~ objects motion ~ per_sample + loss, total + loss.mean() ~ per_sample, total
+loss ~ weights ~ objects motion ~ per_sample + of_memory, total + of_memory.mean() ~ per_sample, total
 salt ~ actions ~ memobench_strict put_only ~ stream, *salted] ~ stream]
-held ~ executions ~ strict 24 ~ append(episode.phase == EXECUTION and not episode.action ~ append(not episode.action
+held ~ executions ~ strict 24 ~ is_held = episode.phase == EXECUTION and not ~ is_held = not
 steps ~ logs ~ tasks=1,12,24,28 ~ "steps": episode.exec_steps, ~ "steps": episode.step_index,
 pauses ~ logs ~ pause_steps=15 ~ _whole_chunks(settings.pause_steps, self._chunk) ~ _whole_chunks(0, self._chunk)
 interval ~ commands ~ recompute ~ 1.959963984540054 ~ 1.6448536269514722

@@ -190,9 +190,7 @@ class MemobenchEnvConfig(_WithSettings):
         chosen = self.selected()  # raises before a folder is created
         check_loop(self.settings)
         policy, by = type(self).check_policy(self)
-        planned = self.settings_for(policy)
-        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
-        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
+        self.declare_plans(policy)
         opened = self.opener(None, by, self.resolved_log_dir())  # None: prompts play in steps
         for memory_type, task_id, folder in chosen:
             envs.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
@@ -210,6 +208,12 @@ class MemobenchEnvConfig(_WithSettings):
             self.__dict__.update(seed_base=seed)
         episodes = int(parser.parse_arg("eval.n_episodes") or EvalConfig.n_episodes)
         check_states(self.suite, seed - self.seed_base, episodes)
+
+    def declare_plans(self, policy: Any) -> None:
+        """Set the actions and frames of a plan from a policy's configuration. Errors as of `settings_for`."""
+        planned = self.settings_for(policy)
+        known = 1 if policy is not None and self.suite == STRICT else None  # it plans at every step
+        self.replan_steps, self.window_steps = planned.replan_steps or known, planned.window_steps
 
     def settings_for(self, policy: Any) -> EnvSettings:
         """Return the settings with defaults that follow from a policy's configuration (None if unknown)."""

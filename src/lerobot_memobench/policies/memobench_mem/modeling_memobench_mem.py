@@ -183,7 +183,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             losses = losses_of(self.config.objective, squared)
             loss = mean_losses(losses, counted_actions(batch, losses))
             per_sample, total = loss.per_sample, loss.mean
-            logged = {"action_loss": total.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
+            logged: dict[str, Any] = {"action_loss": total.item(), "loss_per_dim": loss.per_dim.cpu().tolist()}
             own = {} if self.model.memory is None else self.model.memory.losses({**batch, **memory_pass.outputs})
             for name, of_memory in own.items():
                 per_sample, total = per_sample + of_memory, total + of_memory.mean()
