@@ -56,16 +56,8 @@ class Browser:
         # A shell moves the pipes to the descriptors 3 and 4 that Chromium expects; --no-sandbox because tests may
         # run as root in a container; --disable-gpu because there may be none.
         words = [
-            chromium,
-            "--headless=new",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--disable-dev-shm-usage",
-            "--no-first-run",
-            "--hide-scrollbars",
-            "--mute-audio",
-            f"--user-data-dir={profile}",
-            "--remote-debugging-pipe",
+            *(chromium, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"),
+            *("--hide-scrollbars", "--mute-audio", f"--user-data-dir={profile}", "--remote-debugging-pipe"),
             "about:blank",
         ]
         shell = f'exec "$@" 3<&{command_in} 4>&{answers_out} {command_in}<&- {answers_out}>&-'

@@ -18,20 +18,8 @@ from lerobot_memobench.errors import MemobenchError
 
 PIECES = (
     *(piece.encode() for piece in '()[]{}",:;-$%&#_^~\\/ \n\t\x00é😀'),
-    *(
-        b"0",
-        b"-1",
-        b"NaN",
-        b"1e999",
-        b"null",
-        b"true",
-        b"[]",
-        b"{}",
-        b"\xff\xfe",
-        b"\xef\xbb\xbf",
-        b"\\ud800",
-        b"9" * 400,
-    ),
+    *(b"0", b"-1", b"NaN", b"1e999", b"null", b"true", b"[]", b"{}"),
+    *(b"\xff\xfe", b"\xef\xbb\xbf", b"\\ud800", b"9" * 400),
 )
 
 VALUES: tuple[Any, ...] = (

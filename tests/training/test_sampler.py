@@ -21,7 +21,7 @@ from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem as modeling
 from lerobot_memobench.training.data import DecodedSamples, Training, execution_statistics, open_datasets, open_training
 from lerobot_memobench.training.loop import make_held_out_loader, make_sampler
-from lerobot_memobench.training.sampler import FrameSampler, grouped_order, weighted_order
+from lerobot_memobench.training.sampler import FrameSampler, weighted_order
 from tests.support.held_dataset import HELD, LENGTHS, PROMPTS, STRETCHES, make_held_dataset
 from tests.support.small_policy import small_config
 
@@ -83,15 +83,6 @@ def test_held_frames_are_not_drawn(options: dict[str, Any]) -> None:
         assert sorted(drawn) == np.flatnonzero(ACTS).tolist()
     resumed.resume_from(2, 4, 1)
     assert list(resumed) == drawn[8:]
-
-
-def test_grouped_order_draws_every_frame_once() -> None:
-    ends = np.cumsum([6, 30, 3, 12])
-    order = grouped_order(ends, 3, torch.Generator().manual_seed(1))
-    assert sorted(order.tolist()) == list(range(51))
-    groups = np.searchsorted(ends, order.numpy(), "right").reshape(-1, 3)
-    assert (groups == groups[:, :1]).all(), "three frames of an episode follow one another"
-    assert not torch.equal(order, grouped_order(ends, 3, torch.Generator().manual_seed(2)))
 
 
 @pytest.mark.parametrize("weights", [(1, 1, 1), (1, 3, 2)])
