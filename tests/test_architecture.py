@@ -59,6 +59,12 @@ def test_rasterizer_imports_nothing_of_this_project() -> None:
     assert "mujoco_raster" in {source.partition(".")[0] for source in found}
 
 
+def test_packages_import_neither_research_nor_tests() -> None:
+    sources = sorted(architecture.SOURCE.rglob("*.py"))
+    found = {source for path in sources for source, _ in architecture.imported(ast.parse(path.read_text()))}
+    assert {source.partition(".")[0] for source in found} & {"research", "tests", PACKAGE} == {PACKAGE}
+
+
 def test_no_circular_imports() -> None:
     assert architecture.circle(imports()) == []
 

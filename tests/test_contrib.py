@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import yaml
@@ -18,10 +17,6 @@ from lerobot.envs import factory
 from lerobot.envs import utils as env_utils
 
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-from lerobot_memobench.envs.observations import policy_features, policy_names
-from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.evaluation.metrics import METRICS
-from lerobot_memobench.tasks.catalogue import load_task, task_names
 from tests.support import hub_server
 from tests.test_docs import check, commands
 
@@ -32,11 +27,6 @@ PAGE, PATCH, DOCKERFILE = (
     (CONTRIB / name).read_text() for name in ("memobench.mdx", "lerobot.patch", "Dockerfile.benchmark.memobench")
 )
 (JOB,) = yaml.safe_load((CONTRIB / "benchmark_tests.memobench.yml").read_text()).values()
-
-
-def test_readme_lists_every_file() -> None:
-    listed = set(re.findall(r"^\| `([^`]+?)/?` \|", (CONTRIB / "README.md").read_text(), re.MULTILINE))
-    assert listed == {path.name for path in CONTRIB.iterdir()} - {"README.md"}
 
 
 def test_versions_agree_with_the_package() -> None:
@@ -78,41 +68,6 @@ def test_commands_of_the_smoke_job_are_valid() -> None:
     assert flags["env.expert_action"] == "true", "plain lerobot-eval does not set it"
     assert flags["eval.n_episodes"] == "1"
     assert flags["output_dir"] == report[-1]
-
-
-def test_patch_returns_descriptions_by_video_folder() -> None:
-    added = "\n".join(line[1:] for line in PATCH.splitlines() if line.startswith("+"))
-    (function,) = re.findall(r"^def _memobench_descriptions.*?\n    return [^\n]*\n", added, re.DOTALL | re.MULTILINE)
-    scope: dict[str, Any] = {}
-    exec(compile(function, "patch", "exec"), scope)
-    task = JOB["env"]["MEMOBENCH_TASK"]
-    ((suite, number, folder),) = MemobenchEnvConfig(tasks=task).selected()
-    assert scope["_memobench_descriptions"](task) == {f"{suite}_{number}": load_task(folder).language}
-
-
-# --- tables of the page ---
-
-
-def rows(heading: str) -> list[list[str]]:
-    """Return the rows of the first table after a text of the page, without the header."""
-    table = re.search(r"(?:^\|.*\n)+", PAGE[PAGE.index(heading) :], re.MULTILINE)
-    assert table is not None
-    return [[cell.strip().strip("`") for cell in row.split("|")[1:-1]] for row in table[0].splitlines()[2:]]
-
-
-def test_page_lists_suites_metrics_features_and_tasks() -> None:
-    suites = [suite for suite, *_ in MemobenchEnvConfig().selected()]
-    listed = {suite: int(count) for suite, count, *_ in rows("## Available tasks")}
-    assert listed == {suite: suites.count(suite) for suite in suites}
-    assert [name for name, _ in rows("`memobench report` adds")] == list(METRICS)
-    shapes = {key: tuple(int(n) for n in re.findall(r"\d+", shape)) for key, shape, _ in rows("**Observations:**")}
-    settings = EnvSettings(obs_type="both")
-    names, found = policy_names(settings), policy_features(settings)
-    features = {names[key]: tuple(one.shape) for key, one in found.items() if key != "action"}
-    assert shapes == features | {"observation.phase": (1,), "observation.step": (1,)}
-    named = re.findall(r"\b[a-z]+(?:_[a-z]+){4,}\b", PAGE + yaml.safe_dump(JOB))
-    assert named
-    assert set(named) <= set(task_names())
 
 
 # --- EnvHub ---

@@ -8,23 +8,35 @@ import runpy
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from lerobot_memobench.cli.memobench import main as memobench
 from lerobot_memobench.commands.command_line import parse_words, read_words
+from lerobot_memobench.datasets.card import FAMILIES, LENGTH_BUCKETS
+from lerobot_memobench.envs.video import VideoRecorder
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.metrics import METRICS
+from lerobot_memobench.evaluation.records import read_runs
+from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.policies.remote import RemoteConfig, RemotePolicy
 from lerobot_memobench.policies.remote_connection import pack, unpack_message
 from lerobot_memobench.rollouts.plan import take_run_options
 from lerobot_memobench.sim.object_layout import STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, fill_slots
+from lerobot_memobench.tasks.catalogue import get_task
+from lerobot_memobench.tasks.task import MEMORY_TYPES
 from tests.support import logs
 from tests.support.libero import simulate
+from tests.support.logs import rollout, write_log
 from tests.support.policy_server import batch
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -176,3 +188,156 @@ def observation_at(step: int, rng: np.random.Generator) -> dict[str, Any]:
         "observation.step": torch.tensor([float(step)]),
         "task": ["open the drawer"],
     }
+
+
+# --- demo.py ---
+
+DEMO = EXAMPLES / "demo.py"
+FAILURES: dict[str, dict[int, str]] = {
+    "expert": {},
+    "with_memory": {3: "reference_drift"},
+    "without_memory": {1: "reference_drift", 2: "reference_drift", 3: "storage_failure"},
+}
+"""Evaluation of the second part -> failed episode -> failure class."""
+
+
+@pytest.fixture(scope="module")
+def demo() -> SimpleNamespace:
+    return SimpleNamespace(**runpy.run_path(str(DEMO)))
+
+
+def video(path: Path, length: int, grey: int | None = None) -> Path:
+    """Write a video of one grey level, or from black to white."""
+    recorder = VideoRecorder(path)
+    for k in range(length):
+        recorder.add(np.full((32, 64, 3), 255 * k // (length - 1) if grey is None else grey, np.uint8))
+    recorder.finish()
+    return path
+
+
+def evaluate(demo: SimpleNamespace, words: list[str]) -> None:
+    """Write the output files of an evaluation command."""
+    given = dict(word.split("=", 1) for word in words if "=" in word)
+    folder = Path(given["output_dir"])
+    if folder.name == "expert" and folder.parent.name != "memory":
+        for name in demo.TASKS:
+            video(folder / "videos" / f"{name}.0.mp4", 12)
+        return
+    ends = [FAILURES[folder.name].get(k) for k in range(5)]
+    records = [
+        rollout(demo.STRICT_TASK, "object", "S", [not end], not end, k, failure=end) for k, end in enumerate(ends)
+    ]
+    write_log(folder, records)
+    video(folder / "videos" / f"{demo.STRICT_TASK}.1.mp4", 6, 100)  # the first episode with different outcomes
+
+
+def test_demo_writes_images_and_table(demo: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
+
+    def fake_run(command: list[str], **_: Any) -> None:
+        commands.append(command)
+        evaluate(demo, command)
+
+    monkeypatch.setattr(subprocess, "run", fake_run)
+    monkeypatch.setattr(sys, "argv", ["demo.py", "--out", str(tmp_path)])
+    demo.main()
+    assert {path.name for path in tmp_path.iterdir()} == {
+        *("expert", "memory", "contact_sheet.png", "memory.mp4", "memory.png", "memory.md")
+    }
+    assert [Path(command[0]).name for command in commands] == ["lerobot"] * 4
+    for command in commands:
+        take_run_options(parse_words([word for word in command[2:] if not word.startswith("policy=")]))
+    # The evaluations of the second part differ only in policy and folder.
+    varied = ("policy=", "output_dir=")
+    assert len({tuple(word for word in command if not word.startswith(varied)) for command in commands[1:]}) == 1
+    assert [get_task(name).memory_type for name in demo.TASKS] == ["temporal", "spatial", "object", "procedural"]
+    assert "| without memory | 2/5 |" in (tmp_path / "memory.md").read_text()
+    with Image.open(tmp_path / "contact_sheet.png") as sheet:
+        pixels = np.asarray(sheet.convert("L")).astype(int)
+    assert pixels.shape == (4 * 160, demo.FRAMES_PER_VIDEO * demo.COLUMN_WIDTH)
+    means = pixels[:160].reshape(160, demo.FRAMES_PER_VIDEO, -1).mean(axis=(0, 2))
+    assert (np.diff(means) >= 0).all(), "frames are in order of time"
+    assert (means[0] < 20, means[-1] > 235) == (True, True), "first and last frames are included"
+
+
+# --- the paper's tables ---
+
+PUBLISHED = runpy.run_path(str(EXAMPLES / "paper" / "published.py"))
+published_rows, RAW = PUBLISHED["published_rows"], PUBLISHED["RAW"]
+ROWS = published_rows()
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.table}-{row.model}-{row.replan_steps}")
+def test_published_averages_are_the_mean_of_applicable_memory_types(row: Any) -> None:
+    assert tuple(row.memory_types) == MEMORY_TYPES
+    for metric in METRICS:
+        values = [value for figures in row.memory_types.values() if (value := figures[metric]) is not None]
+        # The paper rounds the memory types as well as their mean.
+        assert row.average[metric] == pytest.approx(sum(values) / len(values), abs=0.1 + 1e-9), metric
+
+
+def test_an_operation_is_published_where_the_catalogue_has_it() -> None:
+    from lerobot_memobench.tasks.catalogue import get_task, task_names
+
+    for memory_type in MEMORY_TYPES:
+        operations = {label for name in task_names(memory_type) for label in get_task(name).operations}
+        for row in ROWS:
+            published = {m for m, value in row.memory_types[memory_type].items() if value is not None}
+            assert published == {"SR"} | {f"M{operation}R" for operation in operations}
+
+
+def test_the_text_quotes_the_tables() -> None:
+    """Sentences of the paper's section on results, each against the rows."""
+
+    def figure(model: str, replan: int, read: Callable[[Any], float | None], table: str = "main") -> object:
+        (row,) = [r for r in published_rows(table) if r.model == model and r.replan_steps == replan]
+        return read(row)
+
+    module = "pi05 + RoboMME Memory Module"
+    assert figure(module, 5, lambda r: r.average["SR"]) == 31.9
+    assert figure("pi05", 50, lambda r: r.average["SR"]) == 20.8
+    assert figure("pi0", 5, lambda r: r.memory_types["temporal"]["MSR"]) == 94.0
+    assert figure("MemoryVLA", 20, lambda r: r.average["MUR"]) == 49.9
+    assert figure("Contrastive Memory Alignment", 5, lambda r: r.average["SR"], "alignment") == 34.7
+
+
+def test_failures_add_up() -> None:
+    counts = dict(RAW["failure_taxonomy"])
+    assert counts.pop("rollouts") == sum(counts.values()) == 150
+
+
+def test_demonstration_statistics_add_up() -> None:
+    families = [RAW["demo_statistics"][name] for name in MEMORY_TYPES]
+    total = RAW["demo_statistics"]["total"]
+    assert sum(f["steps"] for f in families) == total["steps"] == 927_444
+    assert sum(f["episodes"] for f in families) == sum(LENGTH_BUCKETS.values()) == total["episodes"]
+    assert sum(f["gib"] for f in families) == pytest.approx(total["gib"], abs=0.01)
+    for family in families:
+        assert family["mean"] == pytest.approx(family["steps"] / family["episodes"], abs=0.1)
+
+
+def test_cards_of_datasets_have_the_papers_statistics() -> None:
+    published = RAW["demo_statistics"].items()
+    assert {name: tuple(v for key, v in row.items() if key != "gib") for name, row in published} == FAMILIES
+    least = {int(name.rstrip("+").split("-")[0]): count for name, count in RAW["length_buckets"].items()}
+    assert least == LENGTH_BUCKETS
+
+
+def test_tables_with_evaluations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paper: "oracle memory closes 45.5% of the MUR gap and 54.9% of the MCR gap, but only 20.2% of the MSR gap"."""
+    monkeypatch.syspath_prepend(EXAMPLES / "paper")
+    example = runpy.run_path(str(EXAMPLES / "paper" / "tables.py"))
+    (run,) = read_runs([logs.evaluation(tmp_path / "a")])
+    changed = replace(run, protocol={**run.protocol, "horizon": 600, "suite": "strict"})
+    assert example["departures"](changed)[len(example["departures"](run)) :] == [
+        *("suite strict, not published", "horizon 600, not 1200"),
+    ]
+    report = example["paper_report"]([run])
+    text = WRITERS["markdown"](report)
+    assert "| paper: π0.5 + memory module | pixels | 5 | 9.8 | 92.0 | 32.2 | 10.0 |" in text
+    assert text.count("| paper: ") == 43
+    assert "| stale memory first update | 63 | 42.0" in text
+    (average,) = [line for line in text.splitlines() if line.startswith("| **average**")]
+    assert [cell.strip("* ") for cell in average.split("|")][-4:-1] == ["20.2", "45.5", "54.9"]
+    assert "| shuffled | 90.0 | 24.0 | 2.0 |" in text
+    assert r"$\pi_{0.5}$ + memory module" in WRITERS["latex"](report)

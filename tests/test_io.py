@@ -6,7 +6,6 @@ import contextlib
 import errno
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NotRequired, TypedDict
@@ -16,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import AfterValidator
 
-import lerobot_memobench
 from lerobot_memobench.cli.console import as_path
 from lerobot_memobench.datasets.episodes import from_frames
 from lerobot_memobench.errors import MemobenchError
@@ -70,21 +68,6 @@ def test_a_folder_that_cannot_be_read_is_an_error(tmp_path: Path, monkeypatch: p
         files_below(tmp_path)
 
 
-def test_files_below_reads_every_tree() -> None:
-    source = Path(lerobot_memobench.__file__).parent
-    words = ("rglob(", 'glob("**', "/**/", "os.walk(")
-    used = {
-        path.relative_to(source).as_posix()
-        for path in source.rglob("*.py")
-        if any(word in path.read_text(encoding="utf-8") for word in words)
-    }
-    assert used == {
-        "io.py",
-        "rollouts/evaluate.py",
-        "training/command.py",
-    }  # the last two name one file
-
-
 # --- writing ---
 
 
@@ -136,11 +119,9 @@ def test_an_accepted_name_stays_in_its_folder(name: str) -> None:
     [
         ("~/x", "/home/me/x"),
         ("output_dir=~/x", "output_dir=/home/me/x"),
-        ("mine=a~/x", "mine=a~/x"),
         ("policy.align=~", "policy.align=~"),
         ("run: 2", "{here}/run: 2"),
         ("dataset=run: 2", "dataset={here}/run: 2"),
-        ("policy.device=cuda:0", "policy.device=cuda:0"),
     ],
 )
 def test_every_library_recognises_a_path(word: str, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,13 +186,10 @@ GOOD: dict[str, Any] = {"parts": [{"name": "a", "size": 1, "other": "kept"}, {"n
     ("change", "words"),
     [
         ({"share": "1"}, "found share = '1', expected a number"),
-        ({"share": True}, "found share = True, expected a number"),
         ({"share": 1e300}, "found share = 1e+300, expected at most 9007199254740992"),
-        ({"parts": {}}, "found parts = {}, expected a list"),
         ({"parts": [GOOD["parts"][0], 3]}, "found parts[1] = 3, expected an object"),
         ({"parts": [{"size": 1}]}, "found no name in parts[0]"),
         ({"parts": [{"name": "a", "size": "x" * 500}]}, "xxx…, expected an integer or a list"),
-        ({"parts": [{"name": ""}]}, "found parts[0].name = ''"),
     ],
 )
 def test_the_first_place_that_differs_is_named(change: dict[str, Any], words: str) -> None:
@@ -256,14 +234,6 @@ def test_messages_are_ours(tmp_path: Path) -> None:
     path.mkdir()
     with pytest.raises(MemobenchError, match=r"it\.json cannot be read \(Is a directory\); look elsewhere$"):
         read_json(path, Whole, "look elsewhere")
-
-
-def test_commands_that_read_no_file_do_not_import_pydantic() -> None:
-    code = (
-        "import sys, lerobot_memobench.cli.memobench, lerobot_memobench.envs.episode_log;"
-        "sys.exit('pydantic' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("error", [KeyError("a"), OSError(5, "bad\n\ndisk"), RecursionError("x" * 5_000)])

@@ -79,14 +79,6 @@ def test_public_names_are_terms_of_the_field(root: str) -> None:
     assert old_words(ROOT / root) == []
 
 
-def test_old_words_are_detected(tmp_path: Path) -> None:
-    source = "class RowEyes:\n    told_objects: int\n\ndef finds(): ...\n\ndef _twin(): ...\nCROWD = 1\n"
-    (tmp_path / "module.py").write_text(source)
-    (tmp_path / "test_twins.py").write_text(source)
-    found = {line.split()[1] for line in old_words(tmp_path)}
-    assert found == {"RowEyes", "told_objects", "finds", "CROWD"}
-
-
 def too_frequent(places: Iterable[Path]) -> dict[str, tuple[float, list[str]]]:
     """Return words above their limit -> their number per 1,000 lines and the lines."""
     files = [file for place in places for file in (sorted(place.rglob("*.*")) if place.is_dir() else [place])]
@@ -108,12 +100,3 @@ def too_frequent(places: Iterable[Path]) -> dict[str, tuple[float, list[str]]]:
 @pytest.mark.parametrize("name", TEXTS)
 def test_texts_use_plain_words(name: str) -> None:
     assert too_frequent(ROOT / place for place in TEXTS[name]) == {}
-
-
-def test_frequent_words_are_detected(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("A guide.\n" * 1999 + "The log tells more.\n")
-    assert too_frequent([tmp_path]) == {}
-    page.write_text("A guide.\n" * 1998 + "It tells more.\nIt Told more.\n")
-    rate, lines = too_frequent([page])["told, tells, telling"]
-    assert (rate, lines[0]) == (1.0, "page.md:1999: It tells more.")

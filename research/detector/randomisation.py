@@ -191,12 +191,9 @@ class DomainRandomisation:
         model, data = self._sim.model, self._sim.data
         contact = data.contact
         deep = contact.geom[contact.dist < -MAX_CONTACT_DEPTH] if data.ncon else np.zeros((0, 2), np.int64)
-        pairs = [{self._root(int(model.geom_bodyid[geom])) for geom in pair} for pair in deep]
+        roots = model.body_rootid[model.geom_bodyid]
+        pairs = [{str(model.body(roots[geom]).name) for geom in pair} for pair in deep]
         return {name for pair in pairs if pair != {held, ARM} for name in pair} - {"world", held}
-
-    def _root(self, body: int) -> str:
-        model = self._sim.model
-        return str(model.body(model.body_rootid[body]).name)
 
 
 @cache

@@ -14,7 +14,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from lerobot_memobench.tasks.task import SUITES, Task
+from lerobot_memobench.tasks.task import SUITES
 from research.command import run
 from research.judge.cases import cases_of
 from research.judge.stage import Stage, judge
@@ -30,15 +30,10 @@ class Row(NamedTuple):
     given: bool
 
 
-def variant_of(name: str) -> Task:
-    """Return the variant of a task whose cases are judged: the last one, which counts to the most."""
-    task = get_task(name)
-    return task.variant(task.random_variants[-1])
-
-
 def rows_of(name: str) -> list[Row]:
     """Return the verdicts on a task's cases."""
-    task = variant_of(name)
+    published = get_task(name)
+    task = published.variant(published.random_variants[-1])  # the one that counts to the most
     stage = Stage(task)
     return [
         Row(name, task.suite, case.kind, case.accepted, case.is_accepted(task, judge(stage, recording, case.choice)))

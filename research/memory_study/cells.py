@@ -47,8 +47,9 @@ class Demonstrations:
 
     @property
     def _words(self) -> list[str]:
-        words = self.grid.suites[self.suite].demonstration_words
-        return ["memobench", "generate", *words, "--out", str(self.folder)]
+        suite = self.grid.suites[self.suite]
+        tasks = ["--tasks", ",".join(suite.tasks)] if suite.tasks else []
+        return ["memobench", "generate", *suite.demonstrations, *tasks, "--out", str(self.folder)]
 
     def run(self) -> None:
         """Generate them."""

@@ -49,11 +49,6 @@ class Suite:
         return word_of(self.evaluation, "suite") or PUBLISHED
 
     @property
-    def demonstration_words(self) -> list[str]:
-        """Words of ``memobench generate``, with the tasks."""
-        return [*self.demonstrations, *(["--tasks", ",".join(self.tasks)] if self.tasks else [])]
-
-    @property
     def task_words(self) -> list[str]:
         """Words of an evaluation of these tasks."""
         return [f"tasks={','.join(self.tasks)}"] if self.tasks else []

@@ -24,8 +24,7 @@ from lerobot_memobench.sim.files import ASSETS_VARIABLE, OBTAIN, find_assets
 from lerobot_memobench.tasks.catalogue import get_task
 
 DISTRIBUTION, PACKAGE = "lerobot_policy_memobench", "lerobot_memobench"
-RUN_WITH = "0.6.1"
-"""The version of LeRobot with which all tests of this version ran."""
+RUN_WITH = "0.6.1"  # the version of LeRobot with which all tests of this version ran
 SHOWN = ("lerobot", "torch", "transformers", "mujoco", "numpy", "gymnasium", "torchcodec", "av")
 """Packages checked against the requirements of this project and of LeRobot."""
 EXTRAS = ("", "dataset", "training", "evaluation", "pi", "transformers-dep", "av-dep")

@@ -45,11 +45,10 @@ def check_choice(name: str, value: object, known: Sequence[str]) -> None:
         raise MemobenchError(f"{name} is {value!r}; {nearest(str(value), known)}")
 
 
-HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}
-"""Word of a paper -> the hint in place of near words."""
+HINTS = {"libero_long": "LIBERO-Long is 'libero_10'"}  # word of a paper -> the hint in place of near words
 
 
-def nearest(unknown: str, known: Iterable[str], count: int = 3) -> str:
+def nearest(unknown: str, known: Iterable[str]) -> str:
     """Return a hint that names the known words nearest to ``unknown``, or all of them if there are few."""
     if unknown.rpartition(".")[2] in HINTS:
         return HINTS[unknown.rpartition(".")[2]]
@@ -58,7 +57,7 @@ def nearest(unknown: str, known: Iterable[str], count: int = 3) -> str:
         return "there is none"
     likeness = {word: difflib.SequenceMatcher(None, word, unknown).ratio() for word in words}
     least = max(0.4, 3 * max(likeness.values()) - 2)  # a word that is much nearer is the only one
-    close = sorted((word for word in words if likeness[word] >= least), key=lambda word: -likeness[word])[:count]
+    close = sorted((word for word in words if likeness[word] >= least), key=lambda word: -likeness[word])[:3]
     if close:
         return "did you mean " + " or ".join(repr(word) for word in close) + "?"
     if len(words) <= 12:
@@ -66,8 +65,7 @@ def nearest(unknown: str, known: Iterable[str], count: int = 3) -> str:
     return f"none of the {len(words)} known ones is near"
 
 
-LONGEST = 80
-"""Length of quoted values in messages, characters."""
+LONGEST = 80  # length of quoted values in messages, characters
 
 
 def short(value: Any) -> str:

@@ -26,8 +26,7 @@ _IN_WORDS = re.compile(
     "|".join(os.strerror(number) for number in (*FULL, errno.EACCES, errno.EROFS, errno.EIO)), re.IGNORECASE
 )
 """Libraries in C include the system's message in their own errors."""
-LONGEST_NAME = 255
-"""Longest file name of common file systems, bytes."""
+LONGEST_NAME = 255  # longest file name of common file systems, bytes
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Register the environment ``memobench`` and the policies ``memobench_*`` with LeRobot.
+"""Register the environment ``memobench`` and the policies ``memobench_*`` with LeRobot, and check its own commands.
 
 Importing the module of a configuration registers it, without loading the simulator or a model.
 """
@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import lerobot_memobench.policies.baselines
 import lerobot_memobench.policies.memobench_mem.configuration_memobench_mem
 import lerobot_memobench.policies.remote  # noqa: F401
 from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting
-from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
+from lerobot_memobench.envs.lerobot import MemobenchEnvConfig, lerobots_command
 from lerobot_memobench.envs.observations import check_obs_type, policy_features, policy_names
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.convention import MIRRORED
@@ -33,9 +32,7 @@ def prepare_lerobots_command(environment: MemobenchEnvConfig) -> tuple[PreTraine
     from lerobot_memobench.policies.checkpoint import acting
     from lerobot_memobench.policies.compatibility import check_actions, chosen_convention
 
-    name = Path(sys.argv[0]).name.replace("_", "-")  # `lerobot-eval`, or `lerobot_eval.py` of `python -m`
-    command = next((choice for choice in ("train", "eval") if name.startswith(f"lerobot-{choice}")), None)
-    if command is None:
+    if (command := lerobots_command()) is None:
         return None, UNKNOWN_POLICY
     requested = read_words(command, parse_words(sys.argv[1:]))
     policy: PreTrainedConfig | None = requested.build_field("policy")

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from pydantic import TypeAdapter
     from pydantic_core import ErrorDetails
 
-LARGEST = 2**53
-"""Larger integers are not all representable as a double, so browsers and arrays may change them."""
+LARGEST = 2**53  # larger integers are not all representable as a double, so browsers and arrays may change them
 
 Whole = Annotated[int, Ge(-LARGEST), Le(LARGEST)]
 Count = Annotated[int, Ge(0), Le(LARGEST)]
@@ -34,8 +33,7 @@ Name = Annotated[str, MinLen(1), MaxLen(255)]
 Number = Annotated[float, Ge(-LARGEST), Le(LARGEST)]
 
 
-LONGEST_REASON = 200
-"""Length of quoted messages of libraries, characters."""
+LONGEST_REASON = 200  # length of quoted messages of libraries, characters
 
 EXPECTED = {
     "string_type": "text",
@@ -60,12 +58,10 @@ class Malformed(MemobenchError):
     """Content that does not match a schema; the message is the reason without the file."""
 
 
-PACKED = ".gz"
-"""Suffix of a file compressed by ``gzip``."""
+PACKED = ".gz"  # suffix of a file compressed by `gzip`
 POINTER, LARGEST_POINTER = b"version https://git-lfs.github.com/spec/v1", 1024
 """First line of a Git LFS pointer, and its largest size, bytes."""
-LARGEST_UNPACKED = 256 << 20
-"""Largest unpacked size of a compressed file, bytes: about a hundred thousand episodes."""
+LARGEST_UNPACKED = 256 << 20  # largest unpacked size of a compressed file, bytes: about a hundred thousand episodes
 
 
 def is_there(path: Path) -> bool:

@@ -107,7 +107,7 @@ class MEMOBench(StepBenchmark):
         if seed in SPLITS[SEALED]:
             raise MemobenchError(
                 f"seed {seed} belongs to the sealed test; run it by `memobench test-sealed policy=memobench_remote "
-                "dialect=vla_eval`, which counts its runs"
+                "dialect=vla_eval`"
             )
         if trained_convention is not None:
             check_choice(STATED, trained_convention, [*CONVENTIONS])

@@ -17,17 +17,7 @@ from lerobot_memobench.board.submission import CARD, LOG, About, write_submissio
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.board import (
-    ABOUT,
-    SALT,
-    evaluation,
-    first_failure,
-    in_card,
-    in_log,
-    scene_of,
-    sealed,
-    stating,
-)
+from tests.support.board import ABOUT, SALT, evaluation, in_card, in_log, scene_of, sealed, stating
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_author, check_paths, check_submission, read_board
 from tools.board.page import board_rows
@@ -41,10 +31,7 @@ Change = Callable[[Path], object]
 def row(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A valid row with a control; do not change it."""
     place = tmp_path_factory.mktemp("hostile")
-    folders = {
-        "": evaluation(place / "m"),
-        "pauses": evaluation(place / "p", pause_steps=100),
-    }
+    folders = {"": evaluation(place / "m"), "pauses": evaluation(place / "p", pause_steps=100)}
     return write_submission(place / "one", About(**ABOUT), folders)
 
 
@@ -55,6 +42,10 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_submission(
         place / "one", About(**ABOUT), {"": evaluation(place / "m", suite="published", referent="random")}
     )
+
+
+def put(**fields: Any) -> Callable[[Json], object]:
+    return lambda record: record.update(fields)
 
 
 def every(change: Callable[[Json], object]) -> Change:
@@ -80,18 +71,6 @@ def marked(record: Json, steps: list[int | None], ordered: list[int | None] | No
 
 def firsts(record: Json) -> list[Any]:
     return [mark["first_step"] for mark in record["checkpoints"]]
-
-
-def solved(record: Json, step: int) -> None:
-    record.update(success=True, failure=None, lost=False, steps=step)
-    marked(record, [step] * len(record["checkpoints"]))
-
-
-def inputs(words: str, **protocol: Any) -> Change:
-    def change(folder: Path) -> None:
-        in_card(lambda card: card["protocol"].update(inputs=words, **protocol))(folder)
-
-    return change
 
 
 def features(kinds: dict[str, str]) -> Change:
@@ -132,8 +111,7 @@ def relabelled(folder: Path) -> None:
 
 STRICT: dict[str, tuple[Change, str]] = {
     # steps that no execution can have
-    "one checkpoint at once": (one(lambda record: record["checkpoints"][0].update(first_step=2)), "from step 20 on"),
-    "longer than the horizon": (failures(lambda record: record.update(steps=1300)), "at most 1200"),
+    "longer than the horizon": (failures(put(steps=1300)), "at most 1200"),
     "order without checkpoints": (
         one(lambda record: marked(record, firsts(record), [None] * len(record["checkpoints"]))),
         "in order at None",
@@ -142,67 +120,35 @@ STRICT: dict[str, tuple[Change, str]] = {
         one(lambda record: record["checkpoints"][0].update(ordered_step=firsts(record)[0] + 10)),
         "in order at",
     ),
-    "order without a first step": (
-        in_log(lambda log: first_failure(log)["checkpoints"][0].update(ordered_step=300)),
-        "at step None and in order at 300",
-    ),
     # ends that no execution can have
-    "given up early": (failures(lambda record: record.update(steps=900, lost=False)), "ended after 900 of 1200"),
-    "cut off by a horizon": (failures(lambda record: record.update(failure="cut_off")), "the failure class cut_off"),
-    "a fault without a reason": (
-        failures(lambda record: record.update(failure="unstable_physics")),
-        "unstable_physics and the fault None",
-    ),
-    "a reason without a fault": (failures(lambda record: record.update(fault="it broke")), "the fault it broke"),
-    "lost and solved": (successes(lambda record: record.update(lost=True)), "was lost or broken off"),
+    "given up early": (failures(put(steps=900, lost=False)), "ended after 900 of 1200"),
+    "cut off by a horizon": (failures(put(failure="cut_off")), "the failure class cut_off"),
+    "a fault without a reason": (failures(put(failure="unstable_physics")), "unstable_physics and the fault None"),
+    "lost and solved": (successes(put(lost=True)), "was lost or broken off"),
     "never asked whether it was lost": (every(lambda record: record.pop("lost", None)), "has lost=None"),
-    "a goal that did not end it": (successes(lambda record: record.update(steps=1100)), "the goal ends a rollout"),
-    "a goal that was no success": (
-        successes(lambda record: record.update(success=False, failure="execution_failure", steps=1200)),
-        "the goal ends a rollout",
-    ),
-    "failures as successes": (failures(lambda record: record.update(success=True, failure=None)), "success"),
+    "a goal that did not end it": (successes(put(steps=1100)), "the goal ends a rollout"),
     # prompts
-    "no prompt": (every(lambda record: record.update(prompt_steps=0)), "begins after 0 steps"),
-    "a prompt that was not shown": (
-        every(lambda record: record.update(prompt_shown=None)),
-        "has prompt_shown=None",
-    ),
+    "no prompt": (every(put(prompt_steps=0)), "begins after 0 steps"),
     "a prompt of a task without": (
         every(lambda record: record.update(prompt_shown=get_task(record["task"]).prompt is None or None)),
         "prompt_shown",
     ),
     # scenes
-    "scenes of zeros": (every(lambda record: record.update(scene_hash="0" * 16)), "equal for equal seeds only"),
     "no scenes": (every(lambda record: record.pop("scene_hash")), "hashes of 16 digits"),
     "other scenes in a control": (
-        lambda folder: one(lambda record: record.update(scene_hash="ab" * 8))(folder / "pauses"),
+        lambda folder: one(put(scene_hash="ab" * 8))(folder / "pauses"),
         "equal for equal seeds only",
     ),
-    "a hash of a version to come": (
-        in_card(lambda card: card["protocol"].update(scene_hash_version=99)),
-        "scene_hash_version is 99",
-    ),
+    "a hash of a version to come": (protocol(scene_hash_version=99), "scene_hash_version is 99"),
     # pauses
     "more pauses than steps": (
-        lambda folder: one(lambda record: record.update(paused_steps=10**6))(folder / "pauses"),
+        lambda folder: one(put(paused_steps=10**6))(folder / "pauses"),
         r"has \{'paused_steps': 1000000\}, expected",
     ),
     # who acted, on what
-    "a policy of objects as pixels": (features({"observation.environment_state": "ENV"}), "inputs are 'pixels'"),
     "both read, pixels named": (
         both(
-            inputs("pixels", obs_type="both"),
-            features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
-        ),
-        "inputs are 'pixels'",
-    ),
-    "both read by a policy of one's own": (
-        both(
-            in_card(
-                lambda card: (card["policy"].update(type="window"), card["policy"]["settings"].pop("perception", 0))
-            ),
-            inputs("pixels", obs_type="both"),
+            protocol(inputs="pixels", obs_type="both"),
             features({"observation.environment_state": "ENV", "observation.images.image": "VISUAL"}),
         ),
         "inputs are 'pixels'",
@@ -215,15 +161,7 @@ STRICT: dict[str, tuple[Change, str]] = {
         in_card(lambda card: card["settings"].update(env={"expert_action": True})),
         "inputs are 'pixels'",
     ),
-    "features without a form": (
-        both(
-            in_card(lambda card: card["policy"]["settings"].update(input_features=[7])),
-            inputs("pixels", obs_type="environment_state_agent_pos"),
-        ),
-        "inputs are 'pixels'",
-    ),
     "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
-    "settings without a form": (in_card(lambda card: card["settings"].update(env="expert_action")), "settings.env"),
     "versions of other years": (
         in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
         "the card names lerobot 0.1.0",
@@ -234,20 +172,11 @@ STRICT: dict[str, tuple[Change, str]] = {
     ),
     # seeds
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
-    "sealed without a salt": (
-        both(sealed, protocol(salt=None)),
-        "expected a salt with the sealed",
-    ),
-    "a salt that draws other variants": (
-        both(sealed, protocol(salt="6" * 32)),
-        "drew the variants",
-    ),
-    "sealed as by an earlier version": (both(relabelled, every(drawn(None))), "expected a salt with the sealed"),
+    "sealed without a salt": (both(sealed, protocol(salt=None)), "expected a salt with the sealed"),
     "a salt of public seeds": (both(every(drawn(SALT)), protocol(salt=SALT)), "and none with others"),
     # statements
     "a key twice on the card": (twice(CARD, '"protocol": {},'), "a key twice"),
     "look-alike letters": (stating("model", "mеmobench"), "one alphabet"),
-    "wide letters": (stating("model", "ｍｅｍｏ"), "one alphabet"),
     "a call of many people": (stating("submitter", "@team @all"), "submitter = "),
     "a date to come": (stating("date", "9999-12-31"), "date = "),
     "a look-alike host": (stating("links", {"code": "https://www.xn--ggle-55da.com/"}), "begins with https"),
@@ -265,13 +194,12 @@ def test_hostile_submission_is_refused(row: Path, tmp_path: Path, name: str) -> 
 
 
 PUBLISHED: dict[str, tuple[Change, str]] = {
-    "prompts never played": (every(lambda record: record.update(prompt_steps=0, prompt_shown=None)), "begins after 0"),
-    "idling of a strict task": (every(lambda record: record.update(prompt_steps=300)), "begins after 300"),
+    "prompts never played": (every(put(prompt_steps=0, prompt_shown=None)), "begins after 0"),
     "failures as successes": (
-        failures(lambda record: record.update(success=True, failure=None, steps=1000)),
+        failures(put(success=True, failure=None, steps=1000)),
         "without the checkpoint|the goal ends a rollout",
     ),
-    "lost goals": (failures(lambda record: record.update(lost=True)), "lost: absent and True"),
+    "lost goals": (failures(put(lost=True)), "lost: absent and True"),
     "seeds named as sealed": (relabelled, "expected a salt with the sealed"),
 }
 
@@ -311,7 +239,7 @@ def test_scenes_agree_with_those_of_the_board(tmp_path: Path) -> None:
         stating("model", "Other"),
         in_card(lambda card: card["checkpoint"].update(path="user/other")),
         lambda folder: in_card(lambda card: card["checkpoint"].update(path="user/other"))(folder / "pauses"),
-        lambda folder: one(lambda record: record.update(wall_s=1.0))(folder / "pauses"),
+        lambda folder: one(put(wall_s=1.0))(folder / "pauses"),
         lambda folder: shutil.rmtree(folder / "pauses"),
     ],
     ids=["another model", "other weights", "a control's card", "a control's log", "a control less"],

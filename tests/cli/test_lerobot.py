@@ -15,8 +15,7 @@ from urllib.error import URLError
 import lerobot.scripts.lerobot_eval
 import numpy as np
 import pytest
-from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_policy_config
+import torch
 from safetensors.numpy import save_file
 
 from lerobot_memobench.cli.lerobot import main
@@ -168,18 +167,9 @@ def test_backbone_weights_that_cannot_be_fetched(
     def no_network(*_: Any, **__: Any) -> None:
         raise URLError(OSError(-3, "Temporary failure in name resolution"))
 
-    def make_policy(asked: object) -> None:
-        policy = make_policy_config("act", device="cpu", pretrained_backbone_weights="ResNet18_Weights.IMAGENET1K_V1")
-        policy.input_features = {
-            "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
-            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 96, 96)),
-        }
-        policy.output_features = {"action": PolicyFeature(FeatureType.ACTION, (7,))}
-        get_policy_class("act")(policy)
-
     monkeypatch.setenv("TORCH_HOME", str(Path.cwd()))
     monkeypatch.setattr("torch.hub.urlopen", no_network)
-    fake_loop.before = make_policy
+    fake_loop.before = lambda plan: torch.hub.load_state_dict_from_url("https://weights.example/resnet18.pth")
     assert main(["eval", "env=memobench", "policy=act"]) == 2
     error = capsys.readouterr().err
     assert "name resolution" in error
@@ -283,7 +273,6 @@ DEFAULTS: list[tuple[list[str], dict[str, Any]]] = [
         | {"policy.push_to_hub": False, "num_workers": 4, "log_freq": 200},
     ),
     (["policy=act", "steps=50"], {"log_freq": 5}),
-    (["policy=act", "policy.repo_id=user/name"], {"policy.push_to_hub": True}),
     (["policy=act", "dataset=mine"], {"dataset.repo_id": "local/mine", "dataset.root": "mine"}),
     (
         ["config_path=train.yaml", "align=semantic"],
@@ -311,11 +300,15 @@ def test_a_training_gets_the_benchmarks_defaults(
         assert (config.memory_fusion, config.memory_settings) == (own.memory_fusion, own.memory_settings)
 
 
-def test_the_trainers_status_and_a_small_machine(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_machine_has_few_loaders(training: Called, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lerobot_memobench.training.command.cores", lambda: 2)
+    assert main(["train", "policy=act"]) == 0
+    assert training.value("num_workers") == 2
+
+
+def test_the_status_of_lerobots_trainer_is_returned(training: Called) -> None:
     training.action = lambda: 3
     assert main(["train", "policy=act"]) == 3
-    assert training.value("num_workers") == 2
 
 
 def test_settings_that_differ_from_the_checkpoints_are_noted(
@@ -337,22 +330,13 @@ def test_settings_that_differ_from_the_checkpoints_are_noted(
     [
         ([], "policy=memobench_mem"),
         (["policy=memobench_mem", "align=contrastiv"], "contrastive"),
-        (["policy=memobench_mem", "policy.memory=none", "policy.memory_settings={content: false}"], "memory"),
         (["policy=memobench_mem", "policy.memory=recurrent", "policy.memory_settings={length: 4}"], "'length'"),
         ([*SMALL, "align=none", "policy.memory=none", "policy.memory_phase=true"], "memory_phase=True"),
         (["policy=act", "dataset=stuff"], "meta/info.json"),
-        (["policy=act", "dataset=missing"], "memobench generate"),
-        (["policy=act", "device=cuda:99"], "cuda:99"),
         (["resume=true"], "output_dir="),
-        (["resume=true", "output_dir=nowhere"], "nowhere does not exist"),
         (["resume=true", "output_dir=empty"], "no complete checkpoint"),
         (["resume=true", "output_dir=run", "policy=act"], "policy=act"),
-        (["resume=true", "output_dir=run", "config=train_paper"], "config=train_paper"),
-        (["resume=true", "output_dir=run", "--config_path=recipe.yaml"], "config_path=recipe.yaml"),
         (["resume=true", "output_dir=run", "align=semantic"], "align=none"),
-        (["resume=true", "output_dir=run", "policy.optimizer_lr=1e-5"], "leave optimizer_lr out"),
-        (["resume=true", "output_dir=run", "--policy.ema_decay=0"], "ema_decay=0.999"),
-        (["resume=true", "output_dir=run", "optimizer.lr=0.5"], "optimizer.lr=0.001"),
         (["resume=true", "output_dir=run", "dataset=mine"], "dataset a/b"),
         (["resume=true", "output_dir=run", "episodes=[0, 1]"], "dataset.episodes=None"),
         (

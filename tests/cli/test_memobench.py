@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import errno
-import io
 import json
 import os
 import re
@@ -15,7 +13,7 @@ import pytest
 
 from lerobot_memobench.cli.memobench import COMMANDS, main
 from lerobot_memobench.tasks.catalogue import get_task, task_names
-from tests.support.logs import write_log
+from tests.support import logs
 
 TASK = "turn_on_the_stove_and_turn_it_off"
 
@@ -50,25 +48,16 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     [
         (["tasks", "--dir", "nowhere"], "is not a folder"),
         (["tasks", "--dir", "."], "found no"),
-        (["report", "nowhere"], "is not a folder"),
-        (["report", "."], "no episode log"),
         (["report"], "Missing argument"),
         (["generate", "--tasks", "stov", "--out", "x"], "'stov'"),
         (["generate", "--episodes", "0", "--out", "x"], "episodes"),
-        (["generate"], "--out"),
-        (["generate", "--referent", "rnd", "--out", "x"], "random"),
         (["cache", "nowhere"], "nowhere"),
-        (["cache", ".", "--size", "huge"], "tiny"),
         (["recipe", "train_papr"], "'train_paper'"),
         (["frobnicate"], "No such command"),
     ],
 )
 def test_mistakes_are_one_line(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    named: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: list[str], named: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
@@ -116,7 +105,7 @@ def test_tasks_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 # --- generate ---
 
 
-@pytest.mark.parametrize("solved", [2, 1, 0])
+@pytest.mark.parametrize("solved", [2, 0])
 def test_generate_reports_every_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], solved: int
 ) -> None:
@@ -148,57 +137,12 @@ def test_generate_reports_every_seed(
 # --- report and compare ---
 
 
-def evaluation(folder: Path, replan_steps: int = 5, successes: int = 2) -> str:
-    records = [
-        {
-            "task": "a_task",
-            "memory_type": "temporal",
-            "episode": k,
-            "seed": 7 + k,
-            "referent": "fixed",
-            "replan_steps": replan_steps,
-            "success": k < successes,
-            "checkpoints": [
-                {"operation": "S", "first_step": 3, "ordered_step": 3},
-                {"operation": "U", "first_step": 5 if k < successes else None, "ordered_step": None},
-            ],
-        }
-        for k in range(4)
-    ]
-    write_log(folder, records)
-    return str(folder)
-
-
-def test_a_report_is_printed_and_written_beside_the_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
-    assert main(["report", f"p={a}", f"p={b}"]) == 0
-    out = capsys.readouterr().out
-    assert out.count("average of memory types") == 3, "of both, and joined"
-    assert "SR 75.0 at 20" in out
-    assert "75.0 [30.1–95.4]" in out
-    found = json.loads((tmp_path / "a" / "report.json").read_text())
-    assert set(found) == {"tasks", "memory_types", "average", "failures", "prefix", "inputs"}
-    assert main(["report", a, "--format", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["average"]["SR"] == found["average"]["SR"] == 50.0
-
-
-def test_two_evaluations_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    a, b = evaluation(tmp_path / "a"), evaluation(tmp_path / "b", 20, 3)
-    assert main(["compare", a, b]) == 2
-    assert "replan_steps: 5 and 20" in capsys.readouterr().err
-    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "json"]) == 0
-    assert json.loads(capsys.readouterr().out)["differences"][0]["difference"] == 25.0
-    assert main(["compare", a, b, "--allow", "replan_steps", "--format", "csv"]) == 0
-    first = next(csv.DictReader(io.StringIO(capsys.readouterr().out)))
-    assert (first["metric"], first["pairs"], first["difference"]) == ("SR", "4", "25.0")
-
-
 @pytest.mark.parametrize(("option", "number"), [("--out", errno.ENOSPC), ("--html", errno.EROFS)])
 def test_a_disk_that_cannot_be_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, option: str, number: int
 ) -> None:
     """The error is one line, and existing files are whole."""
-    a, out = evaluation(tmp_path / "a"), tmp_path / "out"
+    a, out = str(logs.evaluation(tmp_path / "a")), tmp_path / "out"
     assert main(["report", a, option, str(out)]) == 0
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     assert before

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shutil
 import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 from packaging.markers import default_environment
 from packaging.requirements import Requirement
-
-from lerobot_memobench.sim.simulation import MJCF_CAMERAS, QUALITIES, Simulation
-from tests.support.scripts import load_script
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ["requirements.lock", "scripts/uv-requirements.txt"]
@@ -61,55 +56,10 @@ def test_the_lock_agrees_with_pyproject() -> None:
         assert requirement.specifier.contains(version), f"{line} is locked at {version}; run `make lock`"
 
 
-def test_desktop_packages_are_not_locked() -> None:
-    locked = pins("requirements.lock")
-    assert "opencv-python-headless" in locked
-    assert not {"opencv-python", "pynput", "evdev"} & set(locked)
-
-
-@pytest.mark.parametrize("script", ["scripts/setup", "scripts/lock", ".ci/run"])
-def test_scripts_parse_and_are_executable(script: str) -> None:
-    path = ROOT / script
-    assert path.stat().st_mode & 0o111
-    subprocess.run(["bash", "-n", path], check=True)
-
-
-def test_late_imports_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source, library = tmp_path / "src", tmp_path / "library"
-    for folder in (source / "deep", library):
-        folder.mkdir(parents=True)
-    (source / "deep" / "a.py").write_text("def f():\n    import not_installed_here\n    from found_late import x\n")
-    (library / "found_late.py").write_text("x = 1\n")
-    script = load_script("compile_imports")
-    assert script.imported(source) == {"not_installed_here", "found_late"}
-    monkeypatch.setattr(script, "COMMANDS", ())
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    monkeypatch.syspath_prepend(library)
-    script.compile_imports([source])
-    assert Path(importlib.util.cache_from_source(str(library / "found_late.py"))).is_file()
-
-
-def test_setup_renders_all_qualities(monkeypatch: pytest.MonkeyPatch) -> None:
-    rendered = []
-    monkeypatch.setattr(Simulation, "visible_bodies", lambda simulation, camera: rendered.append(camera))
-    load_script("compile_imports").render()
-    assert rendered == [*MJCF_CAMERAS] * len(QUALITIES)
-
-
 def executable(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"#!/usr/bin/env bash\n{text}\n")
     path.chmod(0o755)
-
-
-def without_ffmpeg(folder: Path) -> str:
-    """Return a PATH of one folder with all programs of the system except ffmpeg."""
-    (folder / "system").mkdir()
-    for place in ("/usr/sbin", "/sbin", "/usr/bin", "/bin", "/usr/local/bin"):
-        for program in Path(place).glob("*"):
-            if program.name != "ffmpeg" and not (folder / "system" / program.name).exists():
-                (folder / "system" / program.name).symlink_to(program)
-    return str(folder / "system")
 
 
 @pytest.fixture
@@ -141,28 +91,6 @@ def test_setup_removes_only_its_own_packages(checkout: Path) -> None:
     assert [call.split()[1] for call in packages] == ["install", "uninstall", "install"], "no `sync`: it removes others"
     assert packages[1].split()[-1] == "dropped-one"
     assert (tmp_path / ".venv/.memobench-lock").read_text() == lock
-
-
-@pytest.mark.parametrize("may", [True, False])
-def test_setup_lists_system_packages_first(checkout: Path, may: bool) -> None:
-    tmp_path = checkout
-    executable(tmp_path / ".uv/bin/uv", "echo uv >&2")
-    executable(tmp_path / ".venv/bin/python", "exit 0")
-    executable(tmp_path / "bin/id", f"echo {0 if may else 1000}")
-    executable(tmp_path / "bin/sudo", "exit 1")
-    executable(tmp_path / "bin/apt-get", 'echo "apt-get $*" >&2')
-    environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{without_ffmpeg(tmp_path)}"}
-    done = subprocess.run([tmp_path / "scripts/setup"], env=environment, capture_output=True, text=True, check=True)
-    printed = done.stderr.splitlines()
-    installed = [line.split()[-1] for line in printed if line.startswith("apt-get install")]
-    if not may:
-        assert not installed
-        assert "will be installed" not in done.stderr
-        assert "ask for: apt-get install" in done.stderr
-        return
-    assert printed[0].startswith("setup: these system packages"), "before uv, Python and everything else"
-    assert printed[0].split("as root: ")[1].split() == installed
-    assert installed == ["ffmpeg"]
 
 
 def test_no_file_names_a_package_registry() -> None:

@@ -15,7 +15,6 @@ from lerobot_memobench.cli.lerobot import main
 from lerobot_memobench.conformance.checks import PASSED, run_checks
 from lerobot_memobench.conformance.subject import load_subject
 from tests.conformance.conftest import EXAMPLE
-from tests.support.lerobot_policies import trainer_in_this_process
 from tests.test_docs import commands
 
 ROOT = Path(__file__).parents[2]
@@ -40,8 +39,7 @@ def test_trained_example_conforms(example: Path, objects: Path, tmp_path: Path) 
     """Phase and step are read without being listed as inputs, so they are not normalised."""
     run = tmp_path / "run"
     words = [*TRAIN, f"dataset={objects}", "steps=4", "batch_size=16", "num_workers=0", f"output_dir={run}"]
-    with trainer_in_this_process():
-        assert main(["train", *words]) == 0
+    assert main(["train", *words]) == 0
     checkpoint = run / "checkpoints" / "last" / "pretrained_model"
     inputs = json.loads((checkpoint / "config.json").read_text())["input_features"]
     assert set(inputs) == {"observation.state", "observation.environment_state"}
@@ -60,7 +58,6 @@ def test_commands_of_the_pages_run_in_their_order(
     monkeypatch.chdir(tmp_path)
     typed = list(commands(ROOT / "docs" / page))
     assert {program for program, *_ in typed} <= {"pip", "python", *programs}
-    with trainer_in_this_process():  # which has the plugin
-        for program, *words in typed:
-            if program in programs:
-                assert programs[program](words) == 0, shlex.join([program, *words])
+    for program, *words in typed:
+        if program in programs:
+            assert programs[program](words) == 0, shlex.join([program, *words])

@@ -178,5 +178,5 @@ def test_refused_destinations_and_episodes(synthetic, demos, make_demo, tmp_path
     staged = stage_demonstration(make_demo(["01"]), tmp_path / "ds" / ".staging" / "episodes" / "000000")
     path = staged.folder / "arrays.npz"
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(MemobenchError, match=r"arrays\.npz is damaged"):
+    with pytest.raises(MemobenchError, match=r"arrays\.npz cannot be read"):
         assemble([staged], tmp_path / "ds")

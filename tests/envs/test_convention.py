@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,8 @@ import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from lerobot.configs import FeatureType
-from lerobot.envs import env_to_policy_features, preprocess_observation
-from lerobot.processor.env_processor import LiberoProcessorStep
+from lerobot.envs import env_to_policy_features
 
 import lerobot_memobench.envs  # noqa: F401
 from lerobot_memobench.constants import EXECUTION, PROMPT
@@ -23,7 +20,6 @@ from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_log
 from lerobot_memobench.envs.evaluation_file import OF_ONE_EVALUATION, differences
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
-from lerobot_memobench.envs.observations import ROBOT_STATE
 from lerobot_memobench.envs.video import BAND
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import headline, read_runs
@@ -59,13 +55,6 @@ def test_libero_mirrors_and_names_what_the_policy_gets() -> None:
     assert tuple(first["pixels"]) == NAMES
 
 
-def test_liberos_names_mean_liberos_images() -> None:
-    for given in ({}, {"convention": "libero"}):
-        config = MemobenchEnvConfig(camera_name_mapping=MAPPING, **given)
-        assert (config.convention, config.settings.convention) == ("libero", "libero")
-    assert config.settings.changed(camera_name_mapping=None, convention=None).convention == "upright"
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -74,22 +63,10 @@ def test_liberos_names_mean_liberos_images() -> None:
         ({"convention": "libero", "obs_type": "environment_state_agent_pos"}, "is of images"),
         ({"observation_height": 360, "obs_type": "environment_state_agent_pos"}, "is of images"),
         ({"convention": "upright", "camera_name_mapping": MAPPING}, "convention is upright; set convention=libero"),
-        *(
-            (
-                {"convention": "libero", "camera_name_mapping": bad},
-                "camera_name_mapping is .*; expected different names",
-            )
-            for bad in (
-                {"agentview": "camera1"},
-                {"agentview_image": "image2"},
-                {"agentview_image": "pixels/camera1"},
-                {"agentview_image": None},
-                "camera1",
-            )
-        ),
+        ({"convention": "libero", "camera_name_mapping": {"agentview": "camera1"}}, "expected different names"),
+        ({"convention": "libero", "camera_name_mapping": {"agentview_image": "image2"}}, "expected different names"),
         ({"observation_width": 15}, "observation_width is 15; expected a whole number from 16 on"),
         ({"observation_height": 361}, "are 361 and 256; expected even numbers up to 2048"),
-        ({"observation_width": 4096}, "are 256 and 4096; expected even numbers up to 2048"),
     ],
 )
 def test_refused_settings(settings: dict[str, Any], named: str) -> None:
@@ -143,30 +120,6 @@ def test_camera_name_mapping_names_the_images(tmp_path: Path) -> None:
     assert protocols[0]["camera_name_mapping"] == MAPPING
     assert [each.split(":")[0] for each in differences(*protocols)] == ["camera_name_mapping.robot0_eye_in_hand_image"]
     assert not differences(*protocols, ignore=OF_ONE_EVALUATION), "evaluations of two policies compare"
-
-
-def test_robot_state_is_that_of_lerobots_libero() -> None:
-    """LeRobot's processor of LIBERO computes the benchmark's own state from it, at home and after a motion."""
-    config = MemobenchEnvConfig(tasks=STOVE, robot_state=True, prompt_in="reset", seed_base=20_000)
-    (tasks,) = config.create_envs(2).values()
-    (env,) = tasks.values()
-    observed, _ = env.reset(seed=[20_000, 20_001])
-    numbers = set()
-    for _ in range(3):
-        assert env.observation_space.contains(observed)
-        found = preprocess_observation(copy.deepcopy(observed))
-        state = found["observation.robot_state"]
-        shapes = {name: {key: tuple(one.shape) for key, one in group.items()} for name, group in state.items()}
-        two = {name: {key: (2, *shape) for key, shape in group.items()} for name, group in ROBOT_STATE.items()}
-        assert shapes == two
-        assert {one.dtype for group in state.values() for one in group.values()} == {torch.float64}
-        theirs = LiberoProcessorStep().observation({"observation.robot_state": state})["observation.state"]
-        assert (theirs - found["observation.state"]).abs().max() <= 1e-5
-        numbers.add(float(theirs[0, 0]))
-        for _ in range(5):
-            observed, *_ = env.step(np.array([[0.8, 0.3, -0.4, 0.9, -0.5, 0.7, 1.0]] * 2, np.float32))
-    assert len(numbers) == 3
-    env.close()
 
 
 def test_log_file_headline_and_comparison_name_images(tmp_path: Path) -> None:

@@ -13,14 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from lerobot_memobench.constants import (
-    EXECUTION,
-    HORIZON,
-    PAPER,
-    SEALED,
-    SPLITS,
-    VALIDATION,
-)
+from lerobot_memobench.constants import HORIZON, PAPER, SEALED, SPLITS, VALIDATION
 from lerobot_memobench.envs.episode import Episode, referent_of
 from lerobot_memobench.envs.episode_log import episode_record
 from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, Pacing
@@ -33,7 +26,6 @@ from lerobot_memobench.tasks.task import STRICT, Task
 STOVE = "turn_on_the_stove_and_turn_it_off"
 STRICT_STOVE = "turn_the_stove_on_and_off_a_given_number_of_times"
 ASSEMBLY = "execute_the_assembly_procedure_demonstrated_in_the_prompt_video"
-HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED = 20_000
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 Policy = Callable[[Episode], NDArray[np.floating[Any]]]
@@ -61,7 +53,7 @@ FAIR = 1e-6
 
 
 @cache
-def drawn(name: str, split: str, count: int = 200) -> list[int]:
+def drawn(name: str, split: str, count: int = 50) -> list[int]:
     task = get_task(name)
     return [referent_of(task, SPLITS[split].start + k).variant_index for k in range(count)]
 
@@ -69,7 +61,7 @@ def drawn(name: str, split: str, count: int = 200) -> list[int]:
 def first_of_rounds(name: str, split: str) -> list[int]:
     """Return the first variant of each balanced block, as an index from 0."""
     choices = get_task(name).random_variants
-    return [choices.index(k) for k in drawn(name, split)[:: len(choices)]]
+    return [choices.index(k) for k in drawn(name, split, 200)[:: len(choices)]]
 
 
 def test_each_split_draws_all_variants_equally_often() -> None:
@@ -79,7 +71,7 @@ def test_each_split_draws_all_variants_equally_often() -> None:
     for name in WITH_VARIANTS:
         choices = get_task(name).random_variants
         for split in (PAPER, "demonstrations", VALIDATION, SEALED):
-            for episodes in (4, 10, 50, 200):
+            for episodes in (4, 10, 50):
                 counts = [drawn(name, split)[:episodes].count(k) for k in choices]
                 assert sum(counts) == episodes, "a variant was drawn that is not admissible"
                 assert max(counts) - min(counts) <= 1
@@ -92,7 +84,7 @@ def test_draws_of_rounds_splits_and_tasks_are_independent() -> None:
         pairs = list(zip(a, b, strict=False))
         return float(stats.binomtest(sum(x == y for x, y in pairs), len(pairs), 1 / number).pvalue)
 
-    for name in WITH_VARIANTS:
+    for name in WITH_VARIANTS[::3]:
         number = len(get_task(name).random_variants)
         validation, paper = first_of_rounds(name, VALIDATION), first_of_rounds(name, PAPER)
         assert stats.chisquare([validation.count(k) for k in range(number)]).pvalue > FAIR
@@ -214,9 +206,7 @@ def test_unreachable_goals_end_strict_episodes_only() -> None:
 
 # --- failures ---
 
-QUICK = {
-    "put_the_tomato_into_the_top_drawer_of_the_cabinet",
-}
+QUICK = {"put_the_tomato_into_the_top_drawer_of_the_cabinet"}
 ALL = [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow) for n in task_names(suite=None)]
 
 
@@ -283,11 +273,3 @@ def test_upstream_ends_when_all_checkpoints_have_held() -> None:
     assert episode_record(upstream, 0, 0.1)["failure"] == "execution_failure"
     paper = run(drawer(OPENED, AT_START), seed=7, horizon=3)
     assert (paper.exec_steps, paper.checkpoints_satisfied) == (3, False)
-
-
-def test_upstream_shows_no_prompt() -> None:
-    episode = Episode(get_task(HIGHLIGHT), rules="upstream")
-    episode.reset(7)
-    assert episode.phase == EXECUTION
-    line = episode_record(episode, 0, 0.1)
-    assert line["prompt_steps"] == 0

@@ -97,7 +97,7 @@ def test_holds_at_the_start_and_after_an_event_are_not_observable() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(("name", "variants"), [(COUNTING, range(3)), (THREE_DRAWERS, range(6))])
+@pytest.mark.parametrize(("name", "variants"), [(COUNTING, range(3)), (THREE_DRAWERS, range(0, 6, 2))])
 def test_a_hold_follows_an_event_and_the_return_to_the_scene_as_it_began(name: str, variants: range) -> None:
     """The same motion in each variant: an idle trip, a drawer opened, shut as another opens, and all shut."""
     episode, found = Episode(get_task(name)), set()

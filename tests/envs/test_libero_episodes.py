@@ -64,17 +64,6 @@ def test_success_ends_an_episode(env: gymnasium.Env[Any, Any]) -> None:
     assert not {"lost", "held_steps"} & {*record}
 
 
-def test_horizon_truncates(env: gymnasium.Env[Any, Any]) -> None:
-    env.reset(seed=9)
-    assert [env.step(NOTHING)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
-    assert env.unwrapped.record()["failure"] == "cut_off"  # type: ignore[attr-defined]
-
-
-def test_object_slots_are_refused() -> None:
-    with pytest.raises(MemobenchError, match="object slots, requires obs_type=pixels_agent_pos"):
-        MemobenchEnv(STOVE, obs_type="both")
-
-
 def test_both_commands_and_vla_eval_run_the_same_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot_memobench.vla_eval import MEMOBench
 

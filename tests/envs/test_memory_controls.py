@@ -21,7 +21,6 @@ from tests.support.logs import protocol_of
 STOVE = "turn_on_the_stove_and_turn_it_off"
 HIGHLIGHT = "put_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 HIDDEN = "find_the_artichoke_hidden_in_one_of_the_drawers"
-STRICT_HIGHLIGHT = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
 SEED, HORIZON = 20_000, 4
 REST = np.array([0, 0, 0, 0, 0, 0, -1], np.float32)
 
@@ -63,24 +62,15 @@ def assert_clock_never_goes_back(frames: list[dict[str, Any]]) -> None:
     assert steps == list(range(len(steps)))
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("swap", "reshow=true"),
-        pytest.param(("delete",), marks=pytest.mark.slow),
-        pytest.param(("noise", "corrupt_step=3"), marks=pytest.mark.slow),
-    ],
-)
-def test_the_shipped_policy_is_corrupted(words: tuple[str, ...], tmp_path: Path) -> None:
-    how, *more = words
+def test_the_shipped_policy_is_corrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("lerobot_memobench.envs.episode.PROMPT_HORIZON", 30)
     settings = [f"tasks={HIGHLIGHT}", "referent=random", "episodes=2", "batch_size=2", "horizon=8", "device=cpu"]
     line = ["eval", "env=memobench", "policy=memobench_strict", *settings, f"output_dir={tmp_path}"]
-    assert main([*line, f"corrupt={how}", *more]) == 0
-    assert [(line["corrupt"], line["corrupted"], line["steps"]) for line in read_episodes(tmp_path)] == [
-        (how, True, 8)
-    ] * 2
-    assert read_evaluation(tmp_path, whole=True)["protocol"]["corrupt"] == how
-    assert f"corrupt={how}" in (tmp_path / "report.md").read_text().splitlines()[0]
+    assert main([*line, "corrupt=swap", "reshow=true"]) == 0
+    lines = read_episodes(tmp_path)
+    assert [(each["corrupt"], each["corrupted"], each["steps"]) for each in lines] == [("swap", True, 8)] * 2
+    assert read_evaluation(tmp_path, whole=True)["protocol"]["corrupt"] == "swap"
+    assert "corrupt=swap" in (tmp_path / "report.md").read_text().splitlines()[0]
 
 
 @pytest.mark.parametrize("task", [HIGHLIGHT, pytest.param(HIDDEN, marks=pytest.mark.slow)])
@@ -97,15 +87,6 @@ def test_the_prompt_is_shown_again_after_the_corruption(task: str) -> None:
     assert len(executed) == len(usual) >= HORIZON + 1, "a strict task is held"
     for one, other in zip(executed, usual, strict=True):
         assert_same_scene(one, other)
-
-
-@pytest.mark.parametrize(
-    ("task", "step"), [(HIGHLIGHT, 0), pytest.param(STRICT_HIGHLIGHT, 0, marks=pytest.mark.slow), (STOVE, 2)]
-)
-def test_memory_is_corrupted_once_at_the_named_step(task: str, step: int) -> None:
-    frames = played(task, corrupt="noise", corrupt_step=step)
-    first = next(number for number, frame in enumerate(frames) if frame["phase"] == EXECUTION)
-    assert [number - first for number, frame in enumerate(frames) if frame["corrupt"]] == [step]
 
 
 def test_other_episodes_are_observed_in_the_prompt_phase() -> None:
@@ -148,14 +129,11 @@ def test_log_and_protocol_record_the_controls(tmp_path: Path) -> None:
 
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"corrupt": "erase"}, "'erase'"),
-    ({"interference": -1}, "from 0 on"),
     ({"corrupt_step": 3}, "corrupt=none"),
     ({"corrupt": "delete", "corrupt_step": 3, "reshow": True}, "corrupt_step=3"),
     ({"interference": 1, "reshow": True}, "one control"),
-    ({"interference": 1, "corrupt": "swap"}, "one control"),
     ({"interference": 1, "prompt_in": "reset"}, "reads prompts"),
     ({"reshow": True, "demonstration_prompt": False}, "demonstration_prompt"),
-    ({"rules": "upstream", "interference": 1}, "upstream"),
 ]
 
 

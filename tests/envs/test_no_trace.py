@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import mujoco
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from lerobot_memobench.experts.travel import come_home
 from lerobot_memobench.sim.object_layout import SLOTS, STARTS, WIDTH
 from lerobot_memobench.sim.object_slots import ObjectSlots, classes
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation
+from lerobot_memobench.sim.world import PARKING_HEIGHT
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom
 from lerobot_memobench.tasks.task import STRICT, Task
@@ -166,10 +168,11 @@ STROKES, STROKE_STEPS = 6, 10
 """Random displacements of a motion, and control steps for which each lasts, so that the hand meets things."""
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(1800)
 @pytest.mark.usefixtures("short_holds")
-@pytest.mark.parametrize("name", task_names(suite=STRICT))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == HIDING else pytest.mark.slow) for name in task_names(suite=STRICT)]
+)
 def test_variants_are_the_same_under_random_actions_until_a_hiding_drawer_opens(name: str) -> None:
     """Physics, object slots and images, bit for bit."""
     task = get_task(name)
@@ -209,3 +212,48 @@ def check_hiding(sim: Simulation) -> None:
     for thing in sim.task.objects:
         moved = np.linalg.norm(sim.body_pose(thing)[0] - fresh.body_pose(thing)[0])
         assert (moved > 0.05) == ("tomato" in thing), thing
+
+
+# --- hidden objects ---
+
+
+def begun(seed: int, variant: int) -> Episode:
+    episode = Episode(get_task(HIDING), demonstration_prompt=False)
+    episode.reset(seed, variant=variant, keep_prompt=True)
+    while not episode.action_has_effect:
+        episode.step(np.zeros(7, np.float32))
+    return episode
+
+
+@pytest.mark.parametrize("joints", [(1.9, -0.3, 1.9, -3.0, -0.8, 0.3, 0.9), (1.3, -0.8, 0.0, -0.7, 1.2, 3.1, 0.3)])
+def test_a_wrist_camera_that_looks_up_lists_no_absent_object(joints: tuple[float, ...]) -> None:
+    episode = begun(20_000, 0)
+    sim, slots = episode.sim, ObjectSlots(episode.sim)
+    sim.data.qpos[:7] = joints
+    mujoco.mj_step1(sim.model, sim.data)
+    seen = slots.observe().reshape(SLOTS, WIDTH)
+    assert not (seen[:, STARTS["position"] + 2] > PARKING_HEIGHT / 2).any()
+    (hidden,) = sim.absent
+    rays = slots.things[next(k for k, t in enumerate(slots.things) if t.body == sim.model.body(hidden).id)]
+    camera = sim.data.cam("robot0_eye_in_hand")
+    direction = camera.xmat.reshape(3, 3).T @ (slots.position(rays) - camera.xpos)
+    assert np.hypot(*direction[:2]) < -direction[2]  # the camera's image contains the parking place
+
+
+def test_an_object_appears_at_rest_in_its_drawer_and_leaves_when_the_scene_is_restored() -> None:
+    episode = begun(20_003, 0)
+    (name, drawer), *_ = episode.task.prompt.places  # type: ignore[union-attr]
+    expert = Expert(episode.task, episode.sim, np.random.default_rng(0))
+    assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2
+    assert not episode.sim.holds(Atom("in", (name, drawer)))
+    for atom in (Atom("open", (drawer,)), Atom("close", (drawer,))):
+        for action in expert.achieve(atom):
+            episode.step(np.clip(action, -1, 1))
+            if episode.sim.body_pose(name)[0][2] < PARKING_HEIGHT / 2:
+                assert episode.sim.holds(Atom("in", (name, drawer)))
+                assert not episode.sim.holds(Atom("lifted", (name,)))
+    assert episode.sim.body_pose(name)[0][2] < PARKING_HEIGHT / 2
+    for action in expert.achieve(Atom("handhome", ())):
+        episode.step(np.clip(action, -1, 1))
+    if episode.sim.holds(Atom("asbegun", ())):
+        assert episode.sim.body_pose(name)[0][2] > PARKING_HEIGHT / 2

@@ -15,11 +15,7 @@ from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.envs.observations import Observer, check_obs_type, obs_type_of, policy_inputs
 from lerobot_memobench.envs.settings import BOTH, DEFAULTS, OBJECTS, OBS_TYPES, PIXELS
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.policies.baselines import (
-    MemobenchExpertConfig,
-    MemobenchRandomConfig,
-    UntrainedConfig,
-)
+from lerobot_memobench.policies.baselines import MemobenchExpertConfig, MemobenchRandomConfig, UntrainedConfig
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.remote import RemoteConfig
 from lerobot_memobench.sim.object_layout import SIZE
@@ -46,7 +42,6 @@ def memory(**settings: Any) -> MemobenchMemConfig:
         (config(ACTConfig, STATE, SLOTS), OBJECTS, POSES),
         (config(ACTConfig), BOTH, f"pixels, {POSES}"),  # before training: everything
         (config(PI05Config, STATE, IMAGE, SLOTS), BOTH, "pixels"),  # it ignores object slots
-        (memory(), PIXELS, "pixels"),
         (memory(perception="objects", detector="package"), PIXELS, "detections"),
         (MemobenchExpertConfig(), PIXELS, "privileged simulator state"),
         (MemobenchRandomConfig(), PIXELS, "nothing"),
@@ -73,7 +68,6 @@ def declared(kind: str, *seen: FeatureType, **more: Any) -> Any:
         (None, None),
         (declared("pi05"), None),
         (declared("memobench_random", FeatureType.VISUAL, perception=UntrainedConfig.perception), None),
-        (declared("act", FeatureType.VISUAL), PIXELS),
         (declared("diffusion", FeatureType.ENV, FeatureType.VISUAL), BOTH),
         (declared("pi05", FeatureType.ENV, FeatureType.VISUAL), PIXELS),
         (declared("mine", FeatureType.ENV), OBJECTS),

@@ -19,7 +19,7 @@ from lerobot_memobench.envs import prompts
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.envs.prompts import PromptPlayer, RestoredPrompt, prompt_file, prompt_player
-from lerobot_memobench.envs.settings import BOTH, OBJECTS, RESET, STEPS
+from lerobot_memobench.envs.settings import BOTH, OBJECTS, STEPS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.sim.simulation import NO_OP, STABILISATION_STEPS, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
@@ -239,13 +239,3 @@ def test_file_name_depends_on_everything_that_affects_the_prompt(folder: Path, m
     assert {path.parent for path in files if path} == {folder}
     monkeypatch.setenv(prompts.VARIABLE, "off")
     assert file() is None
-
-
-def test_only_named_seeds_are_cached(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(episode_module, "PROMPT_HORIZON", 3)
-    env = MemobenchEnv(HIGHLIGHT, obs_type=OBJECTS, prompt_in=RESET)
-    env.reset()
-    assert not folder.exists(), "the prompt of a drawn seed is not cached"
-    env.reset(seed=7)
-    env.reset(seed=7)
-    assert len([*folder.iterdir()]) == 1

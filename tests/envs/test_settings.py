@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
 import lerobot_memobench.registration  # noqa: F401
+from lerobot_memobench.cli.lerobot import help_of
 from lerobot_memobench.constants import EVALUATION_SEED, HOLD_MEAN, HORIZON, UPSTREAM_HORIZON
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode import Episode
@@ -31,6 +31,7 @@ from lerobot_memobench.envs.evaluation_file import (
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
 from lerobot_memobench.envs.settings import GOALS, HOLD, NOT_COMPARED, SCENE_HASHES, SETTINGS, EnvSettings
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.evaluation.comparison import ALLOWED
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.task import STRICT
 
@@ -79,6 +80,8 @@ def test_every_setting_reaches_configuration_environment_and_protocol() -> None:
     fields = {each.name: each for each in dataclasses.fields(EnvSettings)}
     assert all(each.metadata["meaning"] for each in fields.values())
     assert set(SETTINGS) == {*fields} - set(NOT_COMPARED)
+    assert [name for name in fields if f"{name}=" not in help_of("eval")] == []
+    assert {*SETTINGS} - {*ALLOWED} == {"suite"}
     config = MemobenchEnvConfig(horizon=5, pause_steps=3, videos=2)
     assert config.gym_kwargs == dataclasses.asdict(config.settings)
     assert (config.horizon, config.pause_steps, config.videos) == (5, 3, 2)
@@ -220,7 +223,6 @@ def test_folder_keeps_one_protocol_and_one_policy(tmp_path: Path) -> None:
         ("", "JSON"),
         ('{"format": 3, "protocol": {"horizon": -3}, "policy": {}}', "horizon"),
         ('{"format": 2, "protocol": {}, "policy": {}}', "format"),
-        ('{"flags": [], "protocol": {}}', "format"),
     ],
 )
 def test_damaged_and_other_files_are_named(tmp_path: Path, text: str, named: str) -> None:
@@ -228,12 +230,6 @@ def test_damaged_and_other_files_are_named(tmp_path: Path, text: str, named: str
     with pytest.raises(MemobenchError, match=rf"evaluation\.json.*{named}") as caught:
         read_evaluation(tmp_path)
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_may_be_compressed(tmp_path: Path) -> None:
-    facts = facts_of(EnvSettings(), Acting())
-    (tmp_path / f"{EVALUATION_FILE}.gz").write_bytes(gzip.compress(json.dumps(facts).encode()))
-    assert read_evaluation(tmp_path) == read_evaluation(tmp_path / EVALUATION_FILE) == facts
 
 
 def test_resuming_needs_the_whole_file(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.envs.video import OPERATION_COLOURS, VideoRecorder
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import (
@@ -34,7 +33,6 @@ from tests.support import logs
 from tests.support.logs import write_log
 
 STOVE = "turn_on_the_stove_and_turn_it_off"
-BUTTER = "put_the_butter_picked_up_in_the_prompt_video_on_the_plate"
 
 
 def record(task: str = STOVE, episode: int = 0, *, success: bool = True, **changes: Any) -> dict[str, Any]:
@@ -103,19 +101,6 @@ def test_figures_are_those_of_the_report(tmp_path: Path) -> None:
     assert run["commands"] == []
 
 
-def test_a_result_card_tells_policy_horizon_and_command(tmp_path: Path) -> None:
-    evaluation(tmp_path, [record()])
-    command = ["lerobot", "eval", "env=memobench", "output_dir=a folder"]
-    protocol = {**logs.SETTINGS, "tasks": [STOVE], "episodes": 1, "horizon": 200}
-    card = logs.card(protocol, {"type": "memobench_random"})
-    card["runs"][0]["command"] = command
-    write_evaluation(tmp_path, card)
-    run = page_data(read_runs([tmp_path]), [{}], {})["runs"][0]
-    assert run["headline"].startswith("memobench_random: ")
-    assert run["facts"][-1] == "horizon 200"
-    assert run["commands"] == ["lerobot eval env=memobench 'output_dir=a folder'"]
-
-
 def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
     shutil.copytree(get_task(STOVE).folder, tmp_path / "tasks" / "my_task")
     assert task_source([], tmp_path / "tasks")["my_task"].language == get_task(STOVE).language
@@ -129,16 +114,6 @@ def test_texts_are_the_tasks_own(tmp_path: Path) -> None:
     own = {"memory_type": "temporal", "id": None, "language": "task of mine", "variants": {}}
     assert data["tasks"]["task_of_mine"] == own
     assert data["operations"]["U"]["colour"] == "#{:02x}{:02x}{:02x}".format(*OPERATION_COLOURS["U"])
-
-
-def test_a_random_referent_has_its_own_texts(tmp_path: Path) -> None:
-    changes = {"memory_type": "object", "referent": "random", "checkpoints": record()["checkpoints"][:1]}
-    evaluation(tmp_path, [record(BUTTER, 0, variant=2, **changes)])
-    data = page_data(read_runs([tmp_path]), [{}], task_source([BUTTER]))
-    assert list(data["tasks"][BUTTER]["variants"]) == ["2"]
-    texts = data["tasks"][BUTTER]["variants"]["2"]["checkpoints"][0]["texts"]
-    assert texts == list(get_task(BUTTER).variant(2).checkpoints[0].language)
-    assert data["runs"][0]["episodes"][0]["id"] == f"{BUTTER}.0.random"
 
 
 # --- page ---

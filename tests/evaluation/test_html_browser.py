@@ -162,7 +162,7 @@ def test_overview(browser: Any, report: Path) -> None:
     assert [chip.split()[-1] for chip in chips] == ["67", "33"]
     links = browser.js("[...document.querySelectorAll('a.csv')].map((a) => [a.download, a.href])")
     assert [name for name, _ in links] == [
-        *("mine-memory-types.csv", "mine-failures.csv", "mine-tasks.csv", "mine-prefix.csv"),
+        *("mine-memory-types.csv", "mine-failures.csv", "mine-tasks.csv", "mine-prefix.csv")
     ]
     saved = unquote(dict(links)["mine-tasks.csv"].partition(",")[2])
     rates = {row["task"]: row for row in csv.DictReader(io.StringIO(saved))}
@@ -206,17 +206,6 @@ def test_timeline_seeks_the_video(browser: Any, report: Path) -> None:
     browser.choose("#level", "fine")
     browser.wait(f"document.querySelector('.lane.checkpoint .words').textContent === {json.dumps(first[2])}")
     assert browser.js("location.hash.includes('level=fine')")
-
-
-def test_playhead_moves_with_the_video(browser: Any, report: Path) -> None:
-    show(browser, report, f"view=episodes&ep={STOVE}.0")
-    ready(browser)
-    browser.click(".play")
-    browser.wait("Number(document.querySelector('[role=slider]').getAttribute('aria-valuenow')) > 3")
-    browser.click(".play")
-    browser.wait("document.querySelector('video').paused")
-    time = browser.js("document.querySelector('video').currentTime")
-    assert abs(playhead(browser) - time * FPS) <= 2
 
 
 def test_prompt_failure_and_memory_reads(browser: Any, report: Path) -> None:
@@ -331,17 +320,6 @@ def test_long_lists_are_filled_on_demand(browser: Any, tmp_path: Path) -> None:
     assert 0 < box["top"] < 900
 
 
-def test_side_by_side_opens_on_a_pair_that_ends_differently(browser: Any, tmp_path: Path) -> None:
-    failed = {"failure": "storage_failure", "steps": 25}
-    for name, last in (("mine", {}), ("other", failed)):
-        ends = ({}, {}, last)
-        write_log(tmp_path / name, [rollout(STOVE, k, [("S", 10, 10)], **end) for k, end in enumerate(ends)])
-    write_html([tmp_path / "mine", tmp_path / "other"], tmp_path / "page")
-    for chosen, episode in (("", 2), (f"&ep={STOVE}.1", 1)):
-        show(browser, tmp_path / "page" / "index.html", f"view=compare{chosen}")
-        browser.wait(f"document.querySelector('.row[aria-current]').dataset.id === '{STOVE}.{episode}'")
-
-
 def test_one_control_moves_both_videos(browser: Any, report: Path) -> None:
     """The shorter rollout stays on its last frame."""
     show(browser, report, PAIR)
@@ -369,8 +347,7 @@ def test_one_control_moves_both_videos(browser: Any, report: Path) -> None:
 # --- accessibility and security ---
 
 
-def test_controls_have_names_and_text_has_contrast(browser: Any, report: Path) -> None:
-    """WCAG AA: contrast of 4.5 for every text, computed from the colours the browser paints."""
+def test_controls_have_names(browser: Any, report: Path) -> None:
     for address in VIEWS:
         show(browser, report, address)
         nodes = browser.call("Accessibility.getFullAXTree")["nodes"]
@@ -382,43 +359,6 @@ def test_controls_have_names_and_text_has_contrast(browser: Any, report: Path) -
         ]
         assert len(used) > 10
         assert [role for role, name in used if not name.strip()] == []
-        for scheme in ("light", "dark"):
-            browser.colours(scheme)
-            assert browser.js(CONTRAST) == [], (address, scheme)
-        browser.colours("light")
-    ground = "getComputedStyle(document.documentElement).backgroundColor"
-    before = browser.js(ground)
-    browser.click("#theme")
-    assert browser.js(ground) != before
-    browser.js("localStorage.clear()")
-
-
-CONTRAST = """
-(() => {
-  const canvas = new OffscreenCanvas(1, 1).getContext("2d", { willReadFrequently: true });
-  const rgba = (colour) => {
-    canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
-    return [...canvas.getImageData(0, 0, 1, 1).data];
-  };
-  const over = ([r, g, b, a], ground) => [r, g, b].map((v, k) => v * a / 255 + ground[k] * (1 - a / 255));
-  const ground = (e) => {
-    const colour = rgba(getComputedStyle(e).backgroundColor);
-    return colour[3] === 255 || !e.parentElement ? colour.slice(0, 3) : over(colour, ground(e.parentElement));
-  };
-  const light = (rgb) => rgb.map((v) => v / 255).map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
-    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
-  const weak = new Set();
-  for (const e of document.querySelectorAll("body *")) {
-    const text = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
-    const apart = e.closest("svg, script, style, option, .ending, .skip, .visually-hidden");
-    if (!text || apart || !e.checkVisibility()) continue;
-    const back = ground(e), front = over(rgba(getComputedStyle(e).color), back);
-    const [a, b] = [light(back), light(front)].sort((x, y) => y - x);
-    if ((a + 0.05) / (b + 0.05) < 4.5) weak.add(`${e.tagName}.${e.className} ${((a + 0.05) / (b + 0.05)).toFixed(2)}`);
-  }
-  return [...weak];
-})()
-"""
 
 
 def test_a_narrow_screen_needs_no_sideways_scrolling(browser: Any, report: Path) -> None:
@@ -443,10 +383,7 @@ def test_the_page_cannot_reach_the_network(chrome: Any, report: Path) -> None:
 
 def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> None:
     own = {"memory_type": "libero_object", "suite": "libero_object", "convention": "libero"}
-    write_log(
-        tmp_path / "run",
-        [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")],
-    )
+    write_log(tmp_path / "run", [rollout(SOUP, 0, [], **own), rollout(SOUP, 1, [], **own, failure="execution_failure")])
     write_html([tmp_path / "run"], tmp_path / "made")
     show(browser, tmp_path / "made" / "index.html")
     heads = browser.js("[...document.querySelectorAll('#overview table.rates')].map((it) => it.tHead.innerText)")
@@ -455,9 +392,3 @@ def test_a_suite_of_libero_shows_success_alone(browser: Any, tmp_path: Path) -> 
     assert "50.0" in shown
     assert not {word for word in ("MSR", "Average", "Checkpoints", "undefined") if word in shown}
     assert "0 · Pick up the alphabet soup" in shown
-    show(browser, tmp_path / "made" / "index.html", f"view=episodes&ep={SOUP}.1")
-    browser.js("document.querySelector('#keys').showModal()")
-    everything = browser.js("document.body.innerText + document.querySelector('#detail').innerText").lower()
-    memory = ("checkpoint", "memory", "subgoal", "operation", "storage", "msr", "stale", "first held", "undefined")
-    assert not {word for word in memory if word in everything.replace("memobench", "")}
-    assert "the goal was not reached within the step limit" in everything

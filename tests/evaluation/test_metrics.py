@@ -12,14 +12,11 @@ from lerobot_memobench.evaluation.metrics import (
     by_task,
     failure_counts,
     failure_of,
-    faults,
-    inputs_phrase,
     mean_rate,
     report_values,
     summary_of,
     wilson,
 )
-from lerobot_memobench.evaluation.report import pooled_sentence
 from lerobot_memobench.tasks.assessment import FAILURES, asks_order, classify, classify_failure
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from tests.support.logs import record
@@ -102,14 +99,6 @@ def test_versions_of_a_task_are_not_mixed() -> None:
         by_task([rollout("t", "temporal", "S", [1], True), rollout("t", "object", "S", [1], True)])
     with pytest.raises(MemobenchError, match="one of temporal, spatial, object, procedural"):
         by_task([rollout("t", "musical", "S", [1], True)])
-
-
-def test_sentences_of_one_rollout_are_singular() -> None:
-    one = rollout("t", "temporal", "S", [1], True, fault="NaN")
-    assert "1 rollout was broken off and counts as failed" in faults([one])[0]
-    assert "(1 record)" in pooled_sentence(summary_of([one]))
-    inputs = inputs_phrase([{**one, "inputs": "privileged object state"}, one])
-    assert inputs == "not recorded; privileged object state"
 
 
 @pytest.mark.parametrize("n", [1, 40])

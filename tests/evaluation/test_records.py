@@ -9,24 +9,17 @@ from typing import Any
 import pytest
 
 from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
-from lerobot_memobench.envs.evaluation_file import (
-    EVALUATION_FILE,
-    differences,
-    differences_of_parts,
-    write_evaluation,
-)
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.html import write_html
-from lerobot_memobench.evaluation.metrics import failure_counts, summary_of
 from lerobot_memobench.evaluation.records import headline, read_run, read_runs, sweeps
-from lerobot_memobench.evaluation.report import evaluation_report, failures_table, write_report
+from lerobot_memobench.evaluation.report import evaluation_report, write_report
 from lerobot_memobench.evaluation.tables import WRITERS
 from lerobot_memobench.rollouts.shards import merge
-from lerobot_memobench.tasks.assessment import FAILURES
 from lerobot_memobench.tasks.catalogue import task_names
 from tests.support import logs
-from tests.support.logs import SETTINGS, evaluation, facts, rollout, write_log
+from tests.support.logs import SETTINGS, evaluation, facts, write_log
 
 
 def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
@@ -64,21 +57,6 @@ def test_records_have_the_settings_of_their_file(tmp_path: Path) -> None:
     assert found == {**json.loads(line), **expected}
 
 
-def test_differences_of_protocols() -> None:
-    other = {**SETTINGS, "horizon": 600, "replan_steps": 5, "seed_base": 1000, "scene_hash_version": 9}
-    found = ["seed_base: 7 and 1000", "horizon: 1200 and 600", "replan_steps: None and 5"]
-    assert differences(SETTINGS, other) == found
-    assert differences(SETTINGS, other, ignore={"replan_steps", "seed_base"}) == ["horizon: 1200 and 600"]
-    assert differences(SETTINGS, SETTINGS) == differences({"horizon": 600}, {"referent": "fixed"}) == []
-    a, b = {**SETTINGS, "tasks": ["x"]}, {**SETTINGS, "tasks": ["x", "y"]}
-    assert differences(a, b) == []
-    assert differences(a, b, extent=True) == ["tasks: x and x, y"]
-    one, two = (facts(a, {"type": "act", "settings": {"steps": steps}}) for steps in (1, 2))
-    assert differences_of_parts(one, two) == ["policy.settings.steps: 1 and 2"]
-    assert differences_of_parts(one, facts(b)) == []
-    assert differences_of_parts(one, facts(other))[-1] == "scene_hash_version: 2 and 9"
-
-
 # --- names and methods ---
 
 
@@ -96,9 +74,6 @@ def test_methods_are_names_policies_or_folders(tmp_path: Path) -> None:
     assert [run.name for run in sweeps(runs)["act aaaaaaaa"]] == ["a", "b"]
     with pytest.raises(MemobenchError, match="'x'"):
         read_runs([f"x={tmp_path}/a", f"x={tmp_path}/c"])
-    for name, k in (("d", 5), ("e", 5), ("f", 20)):
-        logs.evaluation(tmp_path / name, replan_steps=k)
-    assert [run.method for run in read_runs([tmp_path / name for name in "def"])] == ["d", "e", "f"]
     own = {"type": "act", "settings": {"n_action_steps": 35}}
     logs.evaluation(tmp_path / "own", replan_steps=None, policy=own)
     assert read_runs([tmp_path / "own"])[0].replan_steps == 35, "the policy's own interval, by its card"
@@ -168,18 +143,3 @@ def test_suites_of_libero_are_joined_whatever_their_seeds(tmp_path: Path) -> Non
         write_log(tmp_path / suite, [record(task_names(suite=suite)[0], marks=[], **own)], type="act", seed=seed)
     (run,) = read_runs([tmp_path])
     assert (run.method, [*run.summary.memory_types]) == ("act", ["libero_spatial", "libero_goal"])
-
-
-def test_failures_of_strict_tasks_follow_the_published_ones() -> None:
-    def failed(failure: str, episode: int) -> dict[str, object]:
-        return rollout("one", "temporal", "SU", [True, False], False, episode, failure=failure)
-
-    plain = [failed("stale_memory", 0)]
-    assert list(failure_counts(plain)) == list(FAILURES)
-    counted = failure_counts([*plain, failed("miscount", 1), failed("miscount", 2), failed("wrong_place", 3)])
-    assert counted == {**failure_counts(plain), "miscount": 2, "wrong_place": 1}
-    published = failures_table(summary_of(plain))
-    table = failures_table(summary_of([*plain, failed("miscount", 1)]))
-    assert [row[0] for row in table.rows] == [*(row[0] for row in published.rows), "miscount"]
-    assert "Miscount" in str(table.note)
-    assert "Miscount" not in str(published.note)

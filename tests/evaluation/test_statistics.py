@@ -16,14 +16,7 @@ from lerobot_memobench.evaluation.statistics import detectable, holm, mcnemar, s
 
 @pytest.mark.parametrize(
     ("only_a", "only_b", "p"),
-    [
-        (0, 0, 1.0),
-        (0, 5, 2 / 32),
-        (0, 6, 2 / 64),
-        (6, 0, 2 / 64),
-        (2, 8, 2 * (1 + 10 + 45) / 1024),
-        (4, 4, 1.0),
-    ],
+    [(0, 0, 1.0), (0, 5, 2 / 32), (0, 6, 2 / 64), (6, 0, 2 / 64), (2, 8, 2 * (1 + 10 + 45) / 1024), (4, 4, 1.0)],
 )
 def test_mcnemar_is_the_two_sided_binomial_tail(only_a: int, only_b: int, p: float) -> None:
     assert mcnemar(only_a, only_b) == pytest.approx(p)
@@ -72,14 +65,10 @@ def exact_power(n: int, delta: float, discordant: float) -> float:
     return power
 
 
-@pytest.mark.parametrize(
-    ("n", "discordant"),
-    [(50, 15), pytest.param(100, 20, marks=pytest.mark.slow), pytest.param(200, 60, marks=pytest.mark.slow)],
-)
-def test_the_detectable_difference_is_detected_four_times_in_five(n: int, discordant: int) -> None:
+def test_the_detectable_difference_is_detected_four_times_in_five() -> None:
+    n, discordant = 50, 15
     differences = [1.0] * (discordant // 2) + [-1.0] * (discordant - discordant // 2) + [0.0] * (n - discordant)
     delta = detectable(differences, equal(n))
-    assert delta is not None
     # The exact test is conservative, so its power lies somewhat under the formula's 80 %.
     assert 0.68 < exact_power(n, delta, (discordant + 1) / (n + 2)) < 0.85
 
@@ -89,15 +78,6 @@ def test_where_no_pair_differs_the_detectable_difference_is_not_zero() -> None:
     delta = detectable([0.0] * 200, equal(200))
     assert delta == pytest.approx(7.85 / 200, rel=0.05)
     assert detectable([0.0] * 5, equal(5)) is None
-
-
-def test_more_pairs_detect_less_and_unequal_weights_more() -> None:
-    few, many = detectable([1.0, 0.0] * 20, equal(40)), detectable([1.0, 0.0] * 200, equal(400))
-    uneven = detectable([1.0, 0.0] * 20, [0.5 / 10] * 10 + [0.5 / 30] * 30)
-    assert few is not None
-    assert many is not None
-    assert uneven is not None
-    assert many < few < uneven
 
 
 def test_holm() -> None:

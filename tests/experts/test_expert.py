@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,12 +13,11 @@ from lerobot_memobench.constants import EXECUTION, HORIZON
 from lerobot_memobench.datasets.generate import HOLD_FRAMES, RecordingSettings, compiled_episode, record
 from lerobot_memobench.envs.episode import Episode
 from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.experts.expert import Expert, final_atoms, plan_of, steps_of
+from lerobot_memobench.experts.expert import Expert
 from lerobot_memobench.experts.fixtures import close_drawer, open_drawer
 from lerobot_memobench.experts.grasping import pick, put_on
-from lerobot_memobench.experts.hand import MAX_OPENING_STEPS, OPEN, Hand
+from lerobot_memobench.experts.hand import OPEN, Hand
 from lerobot_memobench.experts.travel import PRESS_STEPS, Held
-from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.simulation import NO_OP, Simulation
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.formula import Atom, parse_formula
@@ -67,29 +65,8 @@ def with_goal(name: str, goal: list[object]) -> Task:
     return dataclasses.replace(get_task(name), goal=parse_formula(goal), checkpoints=())
 
 
-@pytest.mark.parametrize(
-    ("formula", "expected"),
-    [
-        (["then", ["on", "a", "b"], ["and", ["not", ["on", "c", "b"]], ["close", "d"]]], ["on a b", "close d"]),
-        (["or", ["on", "a", "b"], ["on", "a", "c"]], ["on a b"]),
-        (["and", ["wasturnedon", "s"], ["in", "x", "y"]], ["wasturnedon s", "in x y"]),
-        (["when", ["handhome"], ["exactly", 2, ["open", "d"]]], ["open d", "handhome"]),
-    ],
-)
-def test_steps_of_a_formula(formula: list[object], expected: list[str]) -> None:
-    assert [" ".join((atom.predicate, *atom.args)) for atom in steps_of(parse_formula(formula))] == expected
-
-
-def test_a_repair_does_not_repeat_what_only_precedes_the_end() -> None:
-    goal = parse_formula(
-        ["and", ["when", ["on", "a", "b"], ["then", ["on", "c", "d"]]], ["hold", 10, ["on", "a", "b"]]]
-    )
-    assert [str(atom) for atom in final_atoms(goal)] == ["(On a b)"]
-
-
-@pytest.mark.parametrize(("name", "seed"), [(BOWL, 10_002), pytest.param(ASSEMBLY, 8, marks=pytest.mark.slow)])
-def test_solves_in_order_and_smoothly(name: str, seed: int) -> None:
-    play(get_task(name), seed)
+def test_solves_in_order_and_smoothly() -> None:
+    play(get_task(BOWL), 10_002)
 
 
 def test_solves_a_custom_task() -> None:
@@ -154,20 +131,6 @@ def test_shows_every_prompt(name: str, referent: str) -> None:
     play(get_task(name), 10_000, prompt=True, referent=referent)
 
 
-def test_seeds_differ_and_repeat() -> None:
-    def first_actions(seed: int) -> np.ndarray:
-        episode, actions = Episode(get_task(STOVE)), []
-        episode.reset(seed)
-        for _ in range(30):
-            actions.append(episode.expert_action())
-            episode.step(actions[-1])
-        return np.array(actions)
-
-    first = first_actions(10_000)
-    np.testing.assert_array_equal(first_actions(10_000), first)
-    assert np.abs(first_actions(10_001) - first).max() > 0.05
-
-
 # --- the blind routine ---
 
 
@@ -189,57 +152,10 @@ def test_published_task_is_done_and_begun_again() -> None:
     assert turned_on > 1, "it goes on after the goal has come true"
 
 
-# --- the hand ---
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    return np.random.default_rng(3)
-
-
-@pytest.mark.parametrize(("kept_shut", "most"), [(0, 3), (9, 12), (500, MAX_OPENING_STEPS)])
-def test_waits_for_late_opening_fingers(
-    kept_shut: int, most: int, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Three steps with an opening command count; steps in which the command stays closed do not."""
-    commands = iter([1.0] * (kept_shut + 1) + [0.75, 0.5, 0.25])
-    task = SimpleNamespace(suite="strict")
-    sim = SimpleNamespace(eef_pose=lambda: (np.zeros(3), np.eye(3)), command=1.0, task=task)
-    sim.gripper_command = lambda: sim.command
-    monkeypatch.setattr(Hand, "toward", lambda self, position, rotation, gripper: np.full(7, gripper, np.float32))
-    actions = []
-    next(commands)
-    for action in Hand(sim, rng).open(3):
-        actions.append(action)
-        sim.command = next(commands)
-    assert len(actions) == most
-    assert {float(action[6]) for action in actions} == {OPEN}
-
-
-# --- upright frames ---
-
-FLUSH = 2e-3
-"""Distance of a thing's underside from the table, m."""
-UPRIGHT = 0.999
-"""Cosine of a thing's tilt."""
-
-
-def test_objects_are_upright_on_the_table() -> None:
-    """Milk and ketchup have their y axis up; asset frames have z up."""
-    sim = simulate("find_the_specific_milk_pointed_out_in_the_prompt_video_and_put_it_on_the_plate")
-    sim.reset(20_000)
-    for thing in sim.task.objects:
-        position, rotation = sim.asset_pose(thing)
-        assert rotation[2, 2] > UPRIGHT
-        assert abs(position[2] + sim.assets[thing].bottom - TABLE_TOP) < FLUSH
-
-
 # --- strict tasks ---
 
-MICROWAVES = "open_and_close_the_microwave_a_given_number_of_times"
 BLACK_BOWL = "check_the_middle_drawer_once_then_put_the_black_bowl_in_the_top_drawer"
 DRAWERS = "check_all_three_drawers_once_each_in_the_given_order"
-STOVE_AND_PAN = "turn_the_stove_on_and_off_once_then_put_the_frying_pan_on_it"
 CHARGER = "find_the_charger_hidden_in_one_of_the_drawers"
 ARTICHOKE = "find_the_artichoke_hidden_in_one_of_the_drawers"
 BROCCOLI = "find_the_broccoli_hidden_in_one_of_the_drawers"
@@ -252,16 +168,6 @@ CLEAR = "clear_and_serve_strictly_as_demonstrated_in_the_prompt_video"
 WASTE = "discard_and_plate_strictly_as_demonstrated_in_the_prompt_video"
 
 
-def words(task: Task) -> list[str]:
-    """Return the steps of a plan: predicate and last argument, without the cabinet's name."""
-    return [
-        " ".join((step.predicate, *step.args[-1:])).replace("wooden_cabinet_1_", "").replace("_region", "")
-        if isinstance(step, Atom)
-        else f"rest {step.number}"
-        for step in plan_of(task.goal)
-    ]
-
-
 def run(sim: Simulation, motion: Iterator[NDArray[np.float32]]) -> int:
     """Execute a motion and return its number of control steps."""
     steps = 0
@@ -271,21 +177,8 @@ def run(sim: Simulation, motion: Iterator[NDArray[np.float32]]) -> int:
     return steps
 
 
-def test_plan_puts_objects_before_closing() -> None:
-    plan = words(get_task(BLACK_BOWL))
-    assert plan[:5] == ["asbegun", "open middle", "close middle", "asbegun", "open top"]
-    assert plan.index("in top") < plan.index("close top")
-
-
-@pytest.mark.parametrize(
-    ("name", "variant"),
-    [
-        (CHARGER, 2),
-        *(pytest.param(*each, marks=pytest.mark.slow) for each in [(MICROWAVES, 1), (DRAWERS, 5), (STOVE_AND_PAN, 0)]),
-    ],
-)
-def test_solves_a_task_of_each_family(name: str, variant: int) -> None:
-    play(get_task(name).variant(variant), 20_000, prompt=True)
+def test_solves_a_strict_task_with_its_prompt() -> None:
+    play(get_task(CHARGER).variant(2), 20_000, prompt=True)
 
 
 FAILED_ONCE = {

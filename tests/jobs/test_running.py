@@ -45,11 +45,7 @@ def test_killed_workers_are_reported(jobs: list[Note]) -> None:
 
 
 def test_one_run_at_a_time_in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with (
-        locked(tmp_path, tmp_path),
-        pytest.raises(MemobenchError, match=str(tmp_path)),
-        locked(tmp_path, tmp_path),
-    ):
+    with locked(tmp_path, tmp_path), pytest.raises(MemobenchError, match=str(tmp_path)), locked(tmp_path, tmp_path):
         pass
     with locked(tmp_path, tmp_path):  # it is free again
         assert list(tmp_path.iterdir()) == []
@@ -91,7 +87,6 @@ with locked(path, path):
     time.sleep(600)
 """
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
         with pytest.raises(MemobenchError, match=str(tmp_path)), locked(tmp_path, tmp_path):
             pass

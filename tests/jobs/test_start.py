@@ -47,17 +47,13 @@ def test_output_may_be_closed(tmp_path: Path) -> None:
 
 
 @linux
-@pytest.mark.parametrize("unbuffered", ["1", ""])
-@pytest.mark.parametrize("call", ["print('a' * 10**6, flush=True)", "say('a' * 10**6)", "print('a')"])
+@pytest.mark.parametrize(
+    ("call", "unbuffered"), [("print('a' * 10**6, flush=True)", "1"), ("say('a' * 10**6)", ""), ("print('a')", "")]
+)
 def test_a_reader_may_leave(call: str, unbuffered: str) -> None:
     line = '{ sleep 0.2; "$@"; echo "status $?" >&2; } | true'
     done = run_in_shell(line, call, PYTHONUNBUFFERED=unbuffered)
     assert done.stderr == "status 1\n"
-
-
-def test_other_broken_pipes_are_errors() -> None:
-    done = run_in_shell('"$@"', "(_ for _ in ()).throw(BrokenPipeError())")
-    assert "BrokenPipeError" in done.stderr
 
 
 SOCKET = """[

@@ -12,16 +12,7 @@ import pytest
 import torch
 
 from lerobot_memobench.jobs import threads
-from lerobot_memobench.jobs.threads import (
-    ACTING,
-    LARGE,
-    LEARNING,
-    PROCESSES,
-    cores,
-    limit_torch,
-    sharing,
-    torch_threads,
-)
+from lerobot_memobench.jobs.threads import ACTING, LARGE, LEARNING, PROCESSES, cores, limit_torch, torch_threads
 
 
 class Machine:
@@ -85,16 +76,11 @@ def test_limits_of_outer_groups_count(machine: Machine, tmp_path: Path, monkeypa
     ("processors", "role", "large", "processes", "threads_of_torch"),
     [
         (2, ACTING, False, 1, 1),  # a small policy: one process, one core
-        (16, ACTING, False, 1, 1),
         (16, ACTING, False, 8, 1),  # parts of an evaluation
-        (2, ACTING, True, 1, 2),  # size=pi05: all cores
-        (16, ACTING, True, 1, 16),
         (16, ACTING, True, 4, 4),
         (2, ACTING, True, 4, 1),
         (2, LEARNING, False, 1, None),  # torch's own choice
-        (16, LEARNING, False, 1, None),
         (16, LEARNING, False, 4, 4),  # policies trained at once
-        (2, LEARNING, False, 2, 1),
     ],
 )
 def test_threads_of_each_role(
@@ -126,34 +112,6 @@ def test_variables_of_the_user_stay(machine: Machine, environment: dict[str, str
     assert torch.get_num_threads() == before
 
 
-def test_child_processes_decide_again(machine: Machine, environment: dict[str, str]) -> None:
-    machine.has(16)
-    threads.use_threads(ACTING)
-    known = {key: value for key, value in environment.items() if key.endswith(("_NUM_THREADS", "SPINCOUNT"))}
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS"), "1")
-    assert known == {**one, "GOMP_SPINCOUNT": "2000"}
-    threads.use_threads(LEARNING)
-    assert "OMP_NUM_THREADS" not in environment
-    assert "GOMP_SPINCOUNT" not in environment
-    environment.update(sharing(4))
-    threads.use_threads(LEARNING)
-    assert environment["OMP_NUM_THREADS"] == "4"
-    assert environment["LP_NUM_THREADS"] == "1"
-
-
-def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
-    machine.has(16)
-    threads.use_threads(ACTING)
-    before = torch.get_num_threads()
-    try:
-        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
-            environment[PROCESSES] = str(processes)
-            limit_torch(parameters)
-            assert torch.get_num_threads() == found
-    finally:
-        torch.set_num_threads(before)
-
-
 COMMAND = """
 from lerobot_memobench.cli.memobench import main
 main(["tasks", "--help"])
@@ -172,6 +130,19 @@ def ask():
     import torch, os
     return torch.get_num_threads(), os.environ["LP_NUM_THREADS"], os.environ["MEMOBENCH_WORKER"]
 """
+
+
+def test_large_policies_get_more_threads(machine: Machine, environment: dict[str, str]) -> None:
+    machine.has(16)
+    threads.use_threads(ACTING)
+    before = torch.get_num_threads()
+    try:
+        for parameters, processes, found in ((LARGE, 1, 16), (LARGE - 1, 1, 1), (LARGE, 8, 2)):
+            environment[PROCESSES] = str(processes)
+            limit_torch(parameters)
+            assert torch.get_num_threads() == found
+    finally:
+        torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("program", [COMMAND, WORKER], ids=["command", "worker"])

@@ -23,7 +23,6 @@ from tests.support.lerobot_policies import (
     save_checkpoint,
     shrink_paligemma,
     tiny_smolvlm,
-    trainer_in_this_process,
 )
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -43,8 +42,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def train(policy: Path, dataset: Path, run: Path, *words: str) -> Path:
     usual = ("steps=2", "batch_size=2", "num_workers=0", "save_freq=2", "policy.device=cpu")
-    with trainer_in_this_process():
-        assert main(["train", f"policy={policy}", f"dataset={dataset}", f"output_dir={run}", *usual, *words]) == 0
+    assert main(["train", f"policy={policy}", f"dataset={dataset}", f"output_dir={run}", *usual, *words]) == 0
     return run / "checkpoints" / "last" / "pretrained_model"
 
 

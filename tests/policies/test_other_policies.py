@@ -21,7 +21,7 @@ from lerobot_memobench.constants import EXECUTION
 from lerobot_memobench.envs.env import MemobenchEnv
 from lerobot_memobench.envs.episode_log import read_episodes
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.lerobot_policies import shrink_paligemma, tiny_smolvlm, trainer_in_this_process, words_of
+from tests.support.lerobot_policies import shrink_paligemma, tiny_smolvlm, words_of
 from tests.support.logs import protocol_of
 
 TASK = "turn_on_the_stove_and_turn_it_off"
@@ -40,8 +40,7 @@ def train_and_roll_out(dataset: Path, out: Path, *policy: str, inputs: set[str] 
     """Train one step and run one short episode by the two commands; return the protocol of the evaluation."""
     run = out / "train"
     words = ("steps=1", "batch_size=2", "num_workers=0", "save_freq=1", f"output_dir={run}", "policy.device=cpu")
-    with trainer_in_this_process():
-        assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
+    assert main(["train", *policy, f"dataset={dataset}", *words]) == 0
     checkpoint = run / "checkpoints" / "last" / "pretrained_model"
     config = json.loads((checkpoint / "config.json").read_text())
     # Phase, checkpoints, subgoals and language are inputs of memory policies alone.

@@ -12,27 +12,14 @@ from typing import Any
 import huggingface_hub
 import pytest
 
-from lerobot_memobench.envs.episode_log import EpisodeLog, line_of
-from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
-from lerobot_memobench.errors import MemobenchError
-from lerobot_memobench.evaluation.records import disagreement
 from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts.card import (
-    extended,
-    joined_runs,
     policy_facts,
     run_facts,
     training_facts,
     with_checkpoint,
 )
-from lerobot_memobench.rollouts.evaluate import resumed_card
-from lerobot_memobench.rollouts.shards import merge
 from tests.support import logs
-
-
-def record(task: str = "a_task", episode: int = 0, **changes: Any) -> dict[str, Any]:
-    own = {"variant": 0, "prompt_steps": 0, "steps": 100, "scene_hash": "0123456789abcdef", "wall_s": 1.5}
-    return logs.record(task, episode, [("S", 3, 3), ("U", 9, 9)], **own | changes)
 
 
 def card(**changes: Any) -> dict[str, Any]:
@@ -45,36 +32,12 @@ def card(**changes: Any) -> dict[str, Any]:
     return logs.card(**parts | changes)
 
 
-def test_a_card_is_read_back_as_it_was_written(tmp_path: Path) -> None:
-    write_evaluation(tmp_path, card())
-    assert read_evaluation(tmp_path, whole=True) == json.loads(json.dumps(card()))
-
-
-@pytest.mark.parametrize("missing", ["tasks", "episodes"])
-def test_a_card_without_its_extent_is_refused(tmp_path: Path, missing: str) -> None:
-    EpisodeLog(tmp_path).append(line_of(record("a")))
-    now = card()
-    protocol = {key: now["protocol"][key] for key in now["protocol"] if key != missing}
-    write_evaluation(tmp_path, {**now, "protocol": protocol})
-    for use in (lambda: resumed_card(tmp_path, now, print), lambda: merge(tmp_path / "out", [tmp_path])):
-        with pytest.raises(MemobenchError, match=f"{missing} in protocol"):
-            use()
-
-
 # --- facts ---
 
 
-def test_a_policy_is_known_by_settings_checkpoint_and_detector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_is_known_by_settings_and_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     facts = policy_facts({"type": "act", "chunk_size": 50, "device": "cuda", "pretrained_path": "/somewhere"}, 7)
     assert facts == {"type": "act", "seed": 7, "settings": {"chunk_size": 50}}
-    file = tmp_path / "detector.safetensors"
-    file.write_bytes(b"one")
-    settings = {"type": "memobench_mem", "perception": "objects", "detector": str(file)}
-    assert policy_facts(settings, 7)["detector_sha256"] == hashlib.sha256(b"one").hexdigest()
-    assert "detector_sha256" not in policy_facts({**settings, "detector": None, "visual_encoder": str(file)}, 7)
-    file.unlink()
-    with pytest.raises(MemobenchError, match="there is no file"):
-        policy_facts(settings, 7)
     # A repository is known once it has been fetched: the configuration first, the weights when the policy is made.
     snapshot = tmp_path / "models--user--name" / "snapshots" / "0123456789abcdef0123456789abcdef01234567"
     snapshot.mkdir(parents=True)
@@ -126,46 +89,3 @@ def test_this_machine_is_described() -> None:
     head = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
     if head.returncode == 0:
         assert facts["git_commit"].startswith(head.stdout.strip())
-
-
-# --- two runs ---
-
-
-def test_equal_runs_are_counted() -> None:
-    a, b = {"command": ["x"], "batch_size": 1}, {"command": ["y"], "batch_size": 1}
-    assert joined_runs([a, b, a, a]) == [{**a, "times": 3}, {**b, "times": 1}]
-    assert joined_runs([{**a, "times": 3}, a]) == [{**a, "times": 4}]
-    assert joined_runs([{**a, "times": 3}, a], again=False) == [{**a, "times": 3}]
-
-
-def test_a_card_is_widened() -> None:
-    old = card(shard="1/2")
-    wide = card(protocol={"tasks": ["b"], "episodes": 5, "seed_base": 7}, task_files={"b": "2"}, shard="2/2")
-    both = extended(old, wide, Path("old"))
-    assert (both["protocol"]["tasks"], both["protocol"]["episodes"]) == (["a", "b"], 5)
-    assert (both["protocol"]["horizon"], both["task_files"]) == (1200, {"a": "1", "b": "2"})
-    assert both["settings"] == {"env": {"tasks": "a,b"}, "policy": {"type": "act"}}
-    assert (both["runs"][0]["times"], both["shard"]) == (2, None)
-    assert extended(old, old, Path("old"))["shard"] == "1/2"
-
-
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"success": False}, "success is True on the card and False here"),
-        ({"scene_hash": "x"}, "scene_hash is 0123456789abcdef on the card and x here"),
-        ({"steps": 99}, "steps is 100 on the card and 99 here"),
-        ({"seed": 9}, "seed is 7 on the card and 9 here"),
-        ({"checkpoints": []}, "checkpoints is"),
-        (
-            {"checkpoints": [{**each, "ordered_step": 11} for each in record()["checkpoints"]]},
-            "ordered_step of checkpoint 1 is 3 on the card and 11 here",
-        ),
-    ],
-)
-def test_the_first_disagreement_is_named(changes: dict[str, Any], named: str) -> None:
-    assert disagreement(record(), record(wall_s=9.0), "here", "there") is None
-    found = disagreement(record(), record(**changes), "on the card", "here")
-    assert found is not None
-    assert found.startswith("a_task, episode 0: ")
-    assert named in found

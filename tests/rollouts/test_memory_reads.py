@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.envs.env import MemobenchEnv
-from lerobot_memobench.envs.settings import OBJECTS, RESET, EnvSettings
+from lerobot_memobench.envs.settings import OBJECTS, RESET
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.html import page_data, write_html
 from lerobot_memobench.evaluation.records import read_runs
@@ -44,36 +44,6 @@ class Policy:
     def memory_reads(self) -> list[list[Chunk]]:
         assert self.watched
         return self.rows
-
-
-def steps_of(folder: Path, episode: int) -> list[int] | None:
-    found, notes = find_reads(folder, [record(episode=episode, seed=20 + episode)], {})
-    assert not notes
-    return [chunk["step"] for chunk in found[0]] if found else None
-
-
-def test_each_episode_is_written_when_it_ends(tmp_path: Path) -> None:
-    chunks: list[Chunk] = [{"step": step, "entries": [0], "weights": [1.0]} for step in range(3)]
-    policy: Any = Policy(chunks[:2], [], chunks[:1])
-    with noting_reads(tmp_path, EnvSettings(seed_base=20), "a_task", policy, [20, 21, 22]) as ended:
-        ended(np.array([False, False, False]))
-        assert not (tmp_path / "memory_reads").exists()
-        ended(np.array([True, True, False]))
-        assert steps_of(tmp_path, 0) == [0, 1]
-        policy.rows = [chunks, chunks, chunks]  # reads of a finished row are not part of its episode
-        ended(np.array([True, True, False]))
-    assert not policy.watched
-    assert steps_of(tmp_path, 0) == [0, 1]
-    assert steps_of(tmp_path, 1) is None  # a logged episode plans no chunk
-    assert steps_of(tmp_path, 2) == [0, 1, 2]
-
-
-def test_a_rollout_that_fails_writes_no_part_of_an_episode(tmp_path: Path) -> None:
-    policy: Any = Policy([{"step": 0, "entries": [0], "weights": [1.0]}])
-    with pytest.raises(ZeroDivisionError), noting_reads(tmp_path, EnvSettings(), "a_task", policy, [7]):
-        raise ZeroDivisionError
-    assert not policy.watched
-    assert not reads_file(tmp_path, "a_task", 0).exists()
 
 
 @pytest.mark.usefixtures("short_holds")
@@ -156,9 +126,7 @@ def test_reads_are_placed_on_the_timeline(tmp_path: Path) -> None:
     ("changes", "named"),
     [
         ({"seed": 8}, "not of the rollout"),
-        ({"referent": "fixed"}, "not of the rollout"),
         ({"chunks": [{"step": 13, "entries": [0], "weights": [1.0]}]}, "not of the rollout"),
-        ({"chunks": [{"step": 5, "entries": [6], "weights": [1.0]}]}, "not of the rollout"),
         ({"chunks": [{"step": 5, "entries": [0, 1], "weights": [1.0]}]}, "not of the rollout"),
         ({"chunks": [{"step": "5", "entries": [], "weights": []}]}, "expected an integer"),
     ],
@@ -170,11 +138,7 @@ def test_the_file_of_another_rollout_is_left_out(tmp_path: Path, changes: dict[s
     assert named in note
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"no gzip", gzip.compress(b"{}")[:-4], gzip.compress(b"[1]")],
-    ids=["empty", "plain", "cut off", "a list"],
-)
+@pytest.mark.parametrize("content", [b"", gzip.compress(b"{}")[:-4]], ids=["empty", "cut off"])
 def test_a_damaged_file_is_left_out_with_a_note(tmp_path: Path, content: bytes) -> None:
     path = reads_file(tmp_path, "a_task", 0)
     path.parent.mkdir()

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
 import lerobot_memobench.registration  # noqa: F401
 from lerobot_memobench.cli.lerobot import main as lerobot
 from lerobot_memobench.cli.memobench import main
-from lerobot_memobench.envs.episode_log import read_lines, write_episodes
+from lerobot_memobench.constants import SCENE_HASH_VERSION
+from lerobot_memobench.envs.episode_log import log_text, read_lines, write_episodes
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation
+from lerobot_memobench.envs.settings import SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import file_hash
 from lerobot_memobench.perception.detector import SHIPPED
 from lerobot_memobench.policies.checkpoint import checkpoint_files, tree_hash
 from lerobot_memobench.rollouts import rerun
-from lerobot_memobench.rollouts.card import card_of
 from lerobot_memobench.rollouts.plan import EvaluationSettings, card_settings, plan_line
 from lerobot_memobench.rollouts.rerun import (
     allowed_settings,
     check_policy,
     differences_here,
-    plan_of_evaluation,
     read_repeatable,
 )
 from tests.support import logs
@@ -66,50 +65,32 @@ def policy(kind: str, **settings: Any) -> dict[str, Any]:
 HOSTILE: list[tuple[str, dict[str, Any]]] = [
     ("env", {"env": ["tasks"]}),
     ("env.tasks", {"env": {"tasks": "../../elsewhere"}}),
-    ("env.tasks", {"env": {"tasks": ["all"]}}),
     ("env.task_dir", {"env": {"task_dir": "/no/such/folder"}}),
     ("env.log_dir", {"env": {"log_dir": "elsewhere"}}),
-    ("env.features", {"env": {"features": {}}}),
     ("env.horizon", {"env": {"horizon": 1_000_000}}),
-    ("horizon", {"env": {"horizon": "60"}}),
-    ("render", {"env": {"render": "/elsewhere"}}),
     ("policy", {"policy": "memobench_random"}),
     ("policy.path", {"policy": {"path": "stranger/policy"}}),
-    ("policy.path", {"policy": {"path": "http://stranger/a b"}}),
-    ("policy.path", {"policy": {"path": "~nobody/at/all"}}),
     ("policy.path", {"policy": {"path": "a" * 5000}}),
-    ("policy.seed", policy("memobench_random", seed=3.5)),
-    ("policy.seed", policy("memobench_random", seed=True)),
     ("policy.seed", policy("memobench_random", seed=[3])),
     ("policy.down_dims", policy("diffusion", down_dims=[16, "x"])),
-    ("policy.seed", policy("memobench_random", seed="many")),
     ("policy.seed", policy("memobench_random", seed="!!python/object/apply:os.system [x]")),
     ("policy.discover_packages_path", policy("act", discover_packages_path="antigravity")),
-    ("policy.discover_packages_path", policy("act", discover_packages_path="none")),
     ("policy.trust_remote_code", policy("memobench_random", trust_remote_code="true")),
     ("policy.push_to_hub", policy("memobench_random", push_to_hub="true")),
+    ("policy.seed", policy("memobench_random", seed=True)),
     ("policy.repo_id", policy("act", repo_id="stranger/policy")),
-    ("policy.pretrained_path", policy("act", pretrained_path="stranger/policy")),
     ("policy.base_weights", policy("memobench_mem", base_weights="stranger/weights")),
-    ("policy.tokenizer_name", policy("memobench_mem", tokenizer_name="123")),
-    ("policy.vlm_model_name", policy("smolvla", vlm_model_name="stranger/vlm")),
     ("policy.vision_backbone", policy("act", vision_backbone="resnet18")),
     ("policy.device", policy("act", device="cpu;x")),
     ("policy.device", policy("act", device="cuda:64")),
-    ("policy.down_dims", policy("diffusion", down_dims='[16,"x"]')),
-    ("policy.down_dims", policy("diffusion", down_dims="[" * 9999)),
     ("policy.host", policy("memobench_remote", host="10.0.0.5")),
     ("policy.host", policy("memobench_remote", host="127.0.0.1@stranger.example")),
     ("policy.servers", policy("memobench_remote", servers="127.0.0.1:1,stranger.example:80")),
     ("stranger", policy("stranger")),
-    ("seed", {"seed": 7}),
     ("episodes", {"episodes": 1_000}),
     ("batch_size", {"batch_size": 5000}),
-    ("use_async_envs", {"use_async_envs": 1}),
-    ("rename_map", {"rename_map": {"a": 1}}),
     ("rename_map", {"rename_map": {"a": "b c"}}),
     ("output_dir", {"output_dir": "elsewhere"}),
-    ("anything", {"anything": 1}),
 ]
 
 
@@ -224,8 +205,6 @@ def test_a_part_is_repeated_as_a_part(fake_loop: FakeLoop) -> None:
 CHANGES = {
     "only the first": (2, lambda lines: lines[:1]),
     "an episode more": (2, lambda lines: [*lines, {**lines[-1], "episode": 9, "seed": 16}]),
-    "without steps": (2, lambda lines: [{key: lines[0][key] for key in lines[0] if key != "steps"}, *lines[1:]]),
-    "other steps": (1, lambda lines: [lines[0], *({**each, "steps": None} for each in lines[1:])]),
     "other outcome": (1, lambda lines: [{**lines[0], "success": not lines[0]["success"]}, *lines[1:]]),
 }
 
@@ -242,63 +221,57 @@ def test_every_episode_of_a_log_is_compared(fake_loop: FakeLoop, change: str, ca
     assert Path("again").exists() == (status == 1), "an incomplete evaluation is not run"
 
 
-BOOLEAN = st.sampled_from(["true", "false"])
-COUNT = st.integers(1, 300).map(str)
-OF_THE_RUN = {
-    "tasks": st.sampled_from(["all", "object,spatial", STOVE, f"{STOVE},{DRAWER}"]),
-    "episodes": COUNT,
-    "batch_size": COUNT,
-    "seed": st.integers(0, 99).map(str),
-    "referent": st.sampled_from(["fixed", "random"]),
-    "prompt_in": st.sampled_from(["auto", "steps", "reset"]),
-    "horizon": COUNT,
-    "obs_type": st.sampled_from(["pixels_agent_pos", "both"]),
-    "env.render": st.sampled_from(["default", "high"]),
-    "env.videos": COUNT,
-    "env.oracle_memory": BOOLEAN,
-    "pause_steps": COUNT,
-    "speed": st.sampled_from(["1", "0.5", "0.33"]),
-    "eval.use_async_envs": BOOLEAN,
-    "rename_map": st.just('{"observation.images.image": "observation.images.top"}'),
-    "shard": st.sampled_from(["1/1", "2/3"]),
-}
-OF_A_POLICY: dict[str, dict[str, st.SearchStrategy[str]]] = {
-    "memobench_random": {"policy.seed": COUNT, "policy.smoothing": st.sampled_from(["0", "0.5", "1e-3"])},
-    "checkpoint": {"policy.smoothing": st.just("0.25"), "policy.device": st.just("cpu")},
-    "memobench_mem": {
-        "align": st.sampled_from(["none", "contrastive"]),
-        "size": st.just("tiny"),
-        "replan": st.integers(1, 50).map(str),
-        "policy.base_weights": st.just("null"),
-        "policy.optimizer_betas": st.just("[0.9, 0.99]"),
-    },
-    "memobench_remote": {
-        "host": st.sampled_from(["127.0.0.1", "localhost"]),
-        "port": COUNT,
-        "dialect": st.sampled_from(["openpi", "robomme", "vla_eval"]),
-        "policy.label": st.text("abc ()é", max_size=20),
-        "policy.gripper": st.sampled_from(["libero", "rlds"]),
-        "policy.timeout": st.just("7.5"),
-    },
-    "act": {"policy.chunk_size": st.just("100"), "policy.pretrained_backbone_weights": st.just("null")},
-    "diffusion": {"policy.down_dims": st.just("[16,32,64]"), "policy.do_mask_loss_for_padding": BOOLEAN},
-}
+# --- rows of the board ---
+
+BOARD = Path(__file__).parents[2] / "results" / "board"
+ROWS = sorted(file.parent.name for file in BOARD.glob("*/evaluation.json"))
+OTHERWISE = "the versions hash scenes differently"
 
 
-@st.composite
-def command_lines(draw: st.DrawFn) -> list[str]:
-    policy = draw(st.sampled_from(list(OF_A_POLICY)))
-    known = OF_THE_RUN | OF_A_POLICY[policy]
-    keys = draw(st.lists(st.sampled_from(list(known)), unique=True))
-    return ["env=memobench", f"policy={policy}", *(f"{key}={draw(known[key])}" for key in keys)]
+@pytest.mark.slow
+@pytest.mark.parametrize("row", ROWS)
+def test_a_kept_rollout_of_each_row_is_repeated(row: str, tmp_path: Path) -> None:
+    """Its first rollout alone."""
+    card, (first, *_) = read_evaluation(BOARD / row), read_lines(BOARD / row)
+    if (version := card["protocol"][SCENE_HASHES]) != SCENE_HASH_VERSION:
+        pytest.xfail(f"{row}: {OTHERWISE} ({SCENE_HASHES} {version}); run it anew by scripts/renew_row.py")
+    task = first["task"]
+    protocol = card["protocol"] | {"tasks": [task], "episodes": 1}
+    settings = card["settings"] | {"env": card["settings"]["env"] | {"tasks": task}}
+    write_evaluation(tmp_path, card | {"protocol": protocol, "settings": settings})
+    write_episodes(tmp_path, [first])
+    assert main(["rerun", str(tmp_path), "--out", str(tmp_path / "again")]) == 0
 
 
-@settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow])
-@given(command_lines())
-def test_a_card_makes_its_plan_again(line: list[str]) -> None:
-    plan = plan_line([*line, "output_dir=out"])
-    write_evaluation(Path(), card_of(plan))
-    again = plan_of_evaluation(*read_repeatable(Path()), Path("out"))
-    assert again.settings.portable == plan.settings.portable
-    assert (again.options, again.policy, again.environment) == (plan.options, plan.policy, plan.environment)
-    assert (again.seed, again.batch, again.grid) == (plan.seed, plan.batch, plan.grid)
+TWO_EPISODES = ["eval", "env=memobench", f"tasks={STOVE}", "episodes=2", "policy=memobench_random"]
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_scenes_of_another_version_are_not_compared_by_hash(
+    fake_loop: FakeLoop, other: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By rerun, compare, merge and a resumed evaluation."""
+    for out in ("before", "now"):
+        assert lerobot([*TWO_EPISODES, f"output_dir={out}"]) == 0
+    file = Path("before/evaluation.json")
+    card = json.loads(file.read_text())
+    assert card["protocol"][SCENE_HASHES] == SCENE_HASH_VERSION
+    card["protocol"][SCENE_HASHES] -= other
+    file.write_text(json.dumps(card))
+    lines = [{**line, "scene_hash": "other"} for line in read_lines(Path("before"))]
+    Path("before/episodes.jsonl").write_text(log_text(lines))
+    for worker in Path("before/episodes").iterdir():
+        worker.unlink()
+
+    def said(*words: str) -> tuple[int, bool, str]:
+        capsys.readouterr()
+        status = (lerobot if words[0] == "eval" else main)(words)
+        text = " ".join("".join(capsys.readouterr()).split())
+        return status, OTHERWISE in text, text
+
+    assert said("rerun", "before", "--out", "again")[:2] == (int(not other), other)
+    assert said("compare", "before", "now", "--permutations", "100")[:2] == (0 if other else 2, other)
+    assert said("merge", "both", "before", "now")[0] == 2
+    assert not Path("both").exists()
+    status, _, text = said(*TWO_EPISODES[:3], "episodes=3", TWO_EPISODES[-1], "output_dir=before", "resume=true")
+    assert (status, SCENE_HASHES in text) == (2 if other else 0, other), text

@@ -96,11 +96,6 @@ def test_resume_widens_an_evaluation(fake_loop: FakeLoop) -> None:
     [
         ([], "resume=true"),
         (["resume=true", "horizon=600"], "horizon: 1200 and 600"),
-        (["resume=true", "referent=random"], "referent: fixed and random"),
-        (["resume=true", "env.render=high"], "render: default and high"),
-        (["resume=true", "demonstration_prompt=false"], "demonstration_prompt: True and False"),
-        (["resume=true", "env.oracle_memory=true"], "oracle_memory: False and True"),
-        (["resume=true", "env.seed_base=100"], "seed_base: 7 and 100"),
         (["resume=true", "seed=8"], "policy.seed: 7 and 8"),
         (["resume=true", "policy=memobench_random"], "policy.type: memobench_expert and memobench_random"),
         (["resume=true", "shards=2", "horizon=5"], "horizon: 1200 and 5"),

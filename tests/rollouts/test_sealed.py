@@ -46,8 +46,6 @@ def card_in(folder: str) -> dict[str, Any]:
         ({"episodes": 10, "seed_base": 100_050}, "sealed"),
         ({"episodes": 1, "seed_base": 99_999, "prompted_episodes": 9}, "sealed"),
         ({"episodes": 8, "seed_base": 0}, "paper"),
-        ({"episodes": 1, "prompted_episodes": 10_050}, "validation"),
-        ({"episodes": 1, "seed_base": 29_999}, "validation"),
     ],
 )
 def test_demonstrations_have_no_scene_of_an_evaluation(tmp_path: Path, asked: dict[str, int], split: str) -> None:

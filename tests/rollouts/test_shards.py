@@ -17,7 +17,6 @@ from lerobot_memobench.envs.episode_log import EpisodeLog, line_of, read_episode
 from lerobot_memobench.envs.evaluation_file import read_evaluation, write_evaluation, write_facts
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import headline
-from lerobot_memobench.rollouts import shards
 from lerobot_memobench.rollouts.card import policy_facts, run_facts
 from lerobot_memobench.rollouts.plan import plan_line
 from lerobot_memobench.rollouts.shards import merge, merge_and_report, part_folders, plan_shards
@@ -150,26 +149,6 @@ def test_folders_of_parts_are_found_or_named(fake_loop: FakeLoop, capsys: pytest
 # --- jobs ---
 
 
-def test_parts_here_are_run_and_merged(fake_loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards.ShardJob, "run", lambda job: lerobot(job.arguments))
-    assert lerobot([*COMMAND, "output_dir=out", "shards=4", "workers=1"]) == 0
-    assert len(read_episodes(Path("out"))) == 8
-
-
-def test_parts_of_an_array_are_merged_when_all_have_ended(fake_loop: FakeLoop) -> None:
-    """The commands of the guide of clusters: each part by itself, some of them twice."""
-
-    def run(number: int) -> int:
-        return lerobot([*COMMAND, "output_dir=out", f"shard={number}/4", "resume=true"])
-
-    assert [run(number) for number in (4, 1, 3, 1)] == [0] * 4
-    assert memobench(["merge", "out"]) == 1, "a part is missing"
-    assert [run(number) for number in (1, 2, 3, 4)] == [0] * 4
-    assert len(fake_loop.ran) == 8, "finished parts run no episode"
-    assert memobench(["merge", "out"]) == 0
-    assert len(read_episodes(Path("out"))) == 8
-
-
 @pytest.mark.parametrize("gpu", [False, True])
 def test_parts_repeat_the_command_and_decide_the_device_where_they_run(
     fake_loop: FakeLoop, gpu: bool, monkeypatch: pytest.MonkeyPatch
@@ -201,7 +180,6 @@ def test_the_process_of_a_part_ends_with_its_parent(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, *SHARD_PROGRAM, *words], cwd=tmp_path, stdin=subprocess.PIPE)
     while not (tmp_path / "out" / "shard-1-of-1" / "evaluation.json").exists():
         assert process.poll() is None
-    assert process.stdin is not None
     process.stdin.close()
     assert process.wait(60) == 1
 

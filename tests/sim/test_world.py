@@ -132,7 +132,6 @@ def test_on_a_region_of_the_table_needs_no_contact(simulate: Simulate) -> None:
     [
         (Atom("in", (TOMATO, "wooden_cabinet_1_attic_region")), "'wooden_cabinet_1_attic_region'"),
         (Atom("open", (TOMATO,)), "cannot be opened"),
-        (Atom("turnon", ("wooden_cabinet_1_top_region",)), "'turnon'"),
         (Atom("wasopen", ("wooden_cabinet_1_top_region",)), "'wasopen'"),
     ],
 )

@@ -1,26 +1,19 @@
-"""LeRobot's policies in small: settings, checkpoints, language models without a hub; its trainer in this process."""
+"""LeRobot's policies in small: settings, checkpoints, language models without a hub."""
 
 from __future__ import annotations
 
-import io
 import json
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import draccus
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.configs.train import TrainPipelineConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
-from lerobot.scripts import lerobot_train
 
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import make_vocabulary, make_word_tokenizer
-from lerobot_memobench.training import trainer
 
 SMALL: dict[str, dict[str, Any]] = {
     "act": {
@@ -140,22 +133,3 @@ def tiny_smolvlm(out: Path, text: str) -> Path:
     SmolVLMConfig(text_config=words, vision_config=vision, scale_factor=4, image_token_id=image).save_pretrained(folder)
     SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor()).save_pretrained(folder)
     return folder
-
-
-def run_in_this_process(config: TrainPipelineConfig) -> int:
-    with pytest.MonkeyPatch.context() as patch:
-        path = config.checkpoint_path
-        patch.setattr(sys, "argv", ["trainer", *([f"--config_path={path / 'pretrained_model'}"] if path else [])])
-        patch.setattr(sys, "stdin", io.StringIO(json.dumps(draccus.encode(config))))
-        patch.setattr(trainer, "register_plugins", lambda: None)
-        patch.setattr(lerobot_train, "make_train_eval_datasets", None)  # restored at the end
-        trainer.main()
-    return 0
-
-
-@contextmanager
-def trainer_in_this_process() -> Iterator[None]:
-    """Let ``lerobot train`` call LeRobot's trainer instead of starting a process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "run_lerobot", run_in_this_process)
-        yield

@@ -45,10 +45,7 @@ METADATA: dict[str, Any] = {
     "key_frame": [-1, -1],
     "memory": [["a", "b", "c"], ["d", "e", "f"]],
     "operating_type": [[0, 0, 0], [1, 2, 1]],
-    "subtask_goals": [
-        {"and": [["wasopen", "box_1_top_region"]]},
-        {"and": [["in", "cup_1", "box_1_top_region"]]},
-    ],
+    "subtask_goals": [{"and": [["wasopen", "box_1_top_region"]]}, {"and": [["in", "cup_1", "box_1_top_region"]]}],
 }
 
 
@@ -85,11 +82,3 @@ def published() -> Path:
     if not folder.is_dir():
         pytest.skip("no published task folders next to the checkout")
     return folder
-
-
-@pytest.fixture
-def facts() -> Path:
-    """Return the folder of the reference facts and tools; skip without it."""
-    if not (SHARED / "spec" / "catalogue.json").is_file():
-        pytest.skip("no reference facts next to the checkout")
-    return SHARED

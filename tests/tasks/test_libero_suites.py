@@ -19,14 +19,6 @@ def test_suites_hold_130_tasks_of_other_names_than_the_catalogue() -> None:
     assert len({*names, *task_names(suite=None)}) == 130 + 60
 
 
-def test_order_is_that_of_libero() -> None:
-    """First and last names of LIBERO's `libero_suite_task_map.py`."""
-    assert task_names(suite="libero_object")[0] == "pick_up_the_alphabet_soup_and_place_it_in_the_basket"
-    assert task_names(suite="libero_object")[-1] == "pick_up_the_orange_juice_and_place_it_in_the_basket"
-    assert task_names(suite="libero_goal")[0] == "open_the_middle_drawer_of_the_cabinet"
-    assert task_names(suite="libero_90")[0] == "KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet"
-
-
 def test_goals_are_conjunctions_of_libero_s_predicates() -> None:
     """Counts of LIBERO's files."""
     tasks = [get_task(name) for suite in LIBERO_SUITES for name in task_names(suite=suite)]
@@ -34,20 +26,6 @@ def test_goals_are_conjunctions_of_libero_s_predicates() -> None:
     assert counts == {"in": 63, "on": 61, "close": 11, "turnon": 8, "open": 7, "turnoff": 1}
     assert not any(task.checkpoints or task.prompt or task.variants for task in tasks)
     assert all(task.suite == task.memory_type == suite_of(task.name) for task in tasks)
-
-
-@pytest.mark.parametrize(
-    ("name", "language"),
-    [
-        ("KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet", "close the top drawer of the cabinet"),
-        (
-            "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate",
-            "pick up the black bowl on the cookie box and place it on the plate",
-        ),
-    ],
-)
-def test_instruction_is_the_name_without_its_scene(name: str, language: str) -> None:
-    assert get_task(name).language == language
 
 
 def test_initial_states_are_those_of_libero() -> None:

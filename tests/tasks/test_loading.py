@@ -69,23 +69,19 @@ MALFORMED_BDDL = [
     (LANGUAGE, "", 3, ":language"),
     ("(cup_place (:target table_1)", "(cup_place (:target tabel_1)", 5, "'table_1'"),
     ("(cup_place (:target table_1)", "(cup_place (:target table_1) (:target table_1)", 5, "second :target"),
-    ("(:yaw_rotation ((0.0 1.5)))", "(:yaw_rotation ((1.5 0.0)))", 5, "low <= high"),
+    ("lid,v1.2 - lid", "lid,v1.2 (- lid)", 15, "list"),
     ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 -0.2 0.0))", 6, "x1 <= x2"),
     ("((-0.1 -0.1 0.0 0.0))", "((-0.1 -0.1 nan 0.0))", 6, "finite"),
     (" (:ranges ((-0.1 -0.1 0.0 0.0)))", "", 19, ":ranges"),
     ("(box_place", "(cup_place", 6, "again"),
     ("table_1 - kitchen_table", "table_1 - kitchen_table Table_1 - shelf", 10, "'Table_1'"),
-    ("lid,v1.2 - lid", "lid,v1.2 (- lid)", 15, "list"),
     ("(:obj_of_interest cup_1", "(:obj_of_interest cup_3", 17, "'cup_3'"),
     ("    (On cup_1 table_1_cup_place)\n", "", 18, "'cup_1'"),
     ("(On cup_1 table_1_cup_place)", "(On cup_1 table_1_cup_place) (On cup_1 cup_2)", 20, "'cup_1'"),
     ("(On cup_2 table_1_cup_place)", "(On cup_2 lid,v1.2)", 18, "itself"),
     ("(On cup_2 table_1_cup_place)", "(Not (On cup_2 table_1_cup_place))", 21, ":init"),
-    ("(Close box_1_top_region)", "(WasOpen box_1_top_region)", 23, ":init"),
     ("(In cup_1 box_1_top_region)", "(In cup_1 top_region)", 25, "'top_region'"),
-    ("(In cup_1 box_1_top_region)", "(Into cup_1 box_1_top_region)", 25, "'Into'"),
     ("(In cup_1 box_1_top_region)", "(In cup_1 box_1_top_region", 1, "never closed"),
-    ("(Not (Open box_1_top_region))", "(Not)", 25, "Not"),
     ("(Not (Open box_1_top_region))", "(Not " * 5_000 + "(Open box_1)" + ")" * 5_000, 25, "nested"),
     ("(define", "(" * 50_000 + "define", 1, "never closed"),
 ]
@@ -162,13 +158,9 @@ MALFORMED_METADATA: list[tuple[dict[str, Any], str]] = [
     ({"subtask_goals": [["open", "box_1"], ["open", "box_2"]]}, "subtask_goals[1]"),
     ({"operating_type": [[0, 0, 0], [0, 0, 3]]}, "operating_type[1][2]"),
     ({"memory": [["a", "b", "c"], ["a", "b"]]}, "memory[1]"),
-    ({"key_frame": [-1, 0.5]}, "key_frame[1]"),
     ({"memory_type": "episodic"}, "memory_type"),
-    ({"suite": "strikt"}, "suite"),
-    ({"spoilt_as": "lost"}, "spoilt_as"),
-    ({"prompt": {"kind": "pick", "target": "cup_1", "x": 1}}, "prompt"),
-    ({"prompt": {"kind": "grab", "target": "cup_1"}}, "prompt.kind"),
     ({"prompt": {"kind": "pick", "target": "cup_9"}}, "prompt.target"),
+    ({"prompt": {"kind": "pick", "target": "cup_1", "x": 1}}, "prompt"),
     ({"prompt": {"kind": "hide", "places": [["cup_1", "box_1"]]}}, "prompt.places"),
     ({"variants": [{"memory": "M", "substitute": {"cup_1": "cup_7"}}]}, "variants[0].substitute['cup_1']"),
     ({"variants": [{"memory": "M", "order": [0, 0]}]}, "variants[0].order"),
@@ -204,8 +196,6 @@ def test_missing_and_unreadable_files_are_named(write_task: Write, bddl: str, tm
     folder = write_task(bddl, None)
     with pytest.raises(MemobenchError, match=r"task_config\.meta\.json is missing.*subtask_goals"):
         load_task(folder)
-    task = load_task(folder, require_metadata=False)
-    assert (task.checkpoints, task.operations, task.metadata) == ((), "", {})
     with pytest.raises(MemobenchError, match="not a folder"):
         load_task(tmp_path / "nowhere")
     with pytest.raises(MemobenchError, match=r"task_config\.bddl"):
@@ -258,10 +248,9 @@ def test_trees_of_tasks(write_task: Write, tmp_path: Path) -> None:
 # --- damaged files ---
 
 
-@pytest.mark.parametrize(("count", "seed"), [(200, 0), pytest.param(2000, 1, marks=pytest.mark.slow)])
-def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_task: Write) -> None:
-    rng, refused = random.Random(seed), 0
-    for _ in range(count):
+def test_damaged_files_load_or_raise_one_sentence(write_task: Write) -> None:
+    rng, refused = random.Random(0), 0
+    for _ in range(200):
         task = get_task(rng.choice(task_names()))
         folder = write_task(task.bddl_text, (task.folder / "task_config.meta.json").read_text())
         file = folder / rng.choice(["task_config.bddl", "task_config.meta.json"])
@@ -269,7 +258,7 @@ def test_damaged_files_load_or_raise_one_sentence(count: int, seed: int, write_t
         message = refusal(folder)
         refused += bool(message)
         assert not message or (str(folder) in message and "\n" not in message)
-    assert refused > count / 4
+    assert refused > 50
 
 
 def refusal(folder: Path) -> str:

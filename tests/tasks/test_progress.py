@@ -68,7 +68,7 @@ def test_two_evaluations_per_step_and_settling() -> None:
 
 
 def test_task_without_checkpoints(write_task: Callable[..., Path], bddl: str) -> None:
-    task = load_task(write_task(bddl, None), require_metadata=False)
+    task = replace(load_task(write_task(bddl)), checkpoints=())
     progress = play(task, set(), {Atom("in", ("cup_1", "box_1_top_region"))})
     assert (progress.success, progress.satisfied) == (True, ())
 

@@ -1,9 +1,8 @@
-"""LeRobot's own trainer: its view of a dataset, its process, and samples in main memory, equal to LeRobot's."""
+"""LeRobot's own trainer: its view of a dataset, and samples in main memory, equal to LeRobot's."""
 
 from __future__ import annotations
 
-import io
-import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,23 +66,19 @@ def test_policies_without_images_train_from_memory(objects: Path, imaged: Path) 
 
 
 def test_lerobots_trainer_opens_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(words: list[str], input: bytes, **_: Any) -> SimpleNamespace:
-        assert words[1:] == ["-m", trainer.__name__, "--config_path=run/pretrained_model"]
-        monkeypatch.setattr("sys.stdin", io.StringIO(input.decode()))
-        trainer.main()
-        return SimpleNamespace(returncode=0)
+    received: list[Any] = []
 
-    received: list[TrainPipelineConfig] = []
+    def train(config: TrainPipelineConfig) -> None:
+        received[:] = [config, lerobot_train.make_train_eval_datasets, sys.argv[1:]]
+
+    theirs = lerobot_train.make_train_eval_datasets
     policy = make_policy_config("act", device="cpu", push_to_hub=False)
     config = TrainPipelineConfig(DatasetConfig("local/data"), policy=policy, steps=1, resume=True)
     config.checkpoint_path = Path("run")
-    monkeypatch.setattr(subprocess, "run", run)
-    monkeypatch.setattr(trainer, "register_plugins", lambda: None)
-    monkeypatch.setattr(lerobot_train, "make_train_eval_datasets", None)
-    monkeypatch.setattr(lerobot_train, "train", received.append)
-    assert trainer.run_lerobot(config) == 0
-    assert (received[0].steps, received[0].policy) == (1, policy)
-    assert lerobot_train.make_train_eval_datasets is open_trainer_datasets
+    monkeypatch.setattr(lerobot_train, "train", train)
+    trainer.run_lerobot(config)
+    assert received == [config, open_trainer_datasets, ["--config_path=run/pretrained_model"]]
+    assert lerobot_train.make_train_eval_datasets is theirs
 
 
 @pytest.mark.parametrize(("policy", "plan"), [("vqbet", (5, 5)), ("gaussian_actor", (1, 1))])

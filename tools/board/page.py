@@ -31,16 +31,11 @@ class BoardRow:
 
     Attributes:
         name: of its folder.
-        about: statements of the submitter.
-        ranked: whether it enters the ranking.
         rerun: whether the maintainers ran or repeated the evaluation and its controls.
         suite: with the referent where it is not the suite's default.
         assets: origin of the scenes' models.
-        inputs: of the policy.
         seeds: split.
-        episodes: of each task.
-        rates: average of SR, MSR, MUR and MCR.
-        evidence: average over scenes that were run with each variant.
+        rates, evidence: averages.
         pauses: change of SR by the pauses.
         without_memory: SR of the partner without a memory.
     """

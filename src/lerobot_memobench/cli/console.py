@@ -25,12 +25,8 @@ from lerobot_memobench.tasks.task import LiberoSuite, Suite
 
 USAGE_ERROR = 2
 
-#: Columns when the output is not a terminal: task names are long, and a log file has no edge.
-WIDTH_OF_A_FILE = 140
-
-#: Seconds over which the speed of a run is averaged: some tasks take several times as long as others.
-SPEED_PERIOD = 600.0
-
+WIDTH_OF_A_FILE = 140  # columns where the output is no terminal: task names are long, and a log file has no edge
+SPEED_PERIOD = 600.0  # seconds over which speed is averaged: some tasks take several times as long as others
 
 AnySuite = Literal[Suite, LiberoSuite]
 SuiteOption = Annotated[
@@ -125,8 +121,7 @@ def counting(screen: Console, unit: str, total: int | None = None) -> Iterator[C
         yield Count(progress, unit, total)
 
 
-FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)
-"""Errors of torch where it cannot fetch weights."""
+FETCHING = (URLError, HTTPException, ConnectionError, TimeoutError)  # errors of torch where it cannot fetch weights
 
 
 def run_app(app: typer.Typer, arguments: Sequence[str], program: str, again: str) -> int:

@@ -176,12 +176,7 @@ def cache(
     with quiet():
         options: dict[str, Any] = {} if stride is None else {"memory_stride": stride}
         config = MemobenchMemConfig(
-            size=size,
-            perception=perception,
-            detector=detector,
-            visual_encoder=visual_encoder,
-            device=device,
-            **options,
+            size=size, perception=perception, detector=detector, visual_encoder=visual_encoder, device=device, **options
         )
     screen = console()
     with counting(screen, "episodes") as count:

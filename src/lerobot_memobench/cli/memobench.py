@@ -57,8 +57,7 @@ def tasks(
     as_json: AsJson = False,
     suite: SuiteOption = PUBLISHED,
     folder: Annotated[
-        Path | None,
-        typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue."),
+        Path | None, typer.Option("--dir", help="A task folder, or a folder of them, instead of the catalogue.")
     ] = None,
 ) -> int:
     """List the benchmark's tasks, or those of a folder."""
@@ -170,9 +169,7 @@ def assets(
 # --- train ---
 
 
-def recipe(
-    name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None,
-) -> int:
+def recipe(name: Annotated[str | None, typer.Argument(help="A recipe; all are listed without it.")] = None) -> int:
     """Print the file of a training recipe. As in `lerobot-train --config_path=$(memobench recipe train_paper)`."""
     from lerobot_memobench.commands.command_line import recipe_file, recipes
 
@@ -251,8 +248,7 @@ COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
 
 RESUMED = ("generate", "cache", "convert", "push", "assets")
 """Commands that continue when given again; any other starts over."""
-LEARN = ("cache",)
-"""Commands that train or encode in their own process; the others simulate, or compute little."""
+LEARN = ("cache",)  # commands that train or encode in their own process; the others simulate, or compute little
 
 for group, commands in COMMANDS.items():
     for command in commands:
@@ -278,7 +274,7 @@ def options(
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit status."""
     words = [as_path(word) for word in (sys.argv[1:] if argv is None else argv)]
-    use_threads(LEARNING if words and words[0] in LEARN else ACTING)
+    use_threads(LEARNING if words and words[0] in LEARN else ACTING)  # before torch is imported
     verb = "resume" if words and words[0] in RESUMED else "start again"
     return run_app(app, words, "memobench", f"{verb} with: {shlex.join(['memobench', *words])}")
 

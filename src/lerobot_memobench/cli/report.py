@@ -137,8 +137,7 @@ def rerun(
     card: Annotated[Path, typer.Argument(help="The folder of an evaluation, or its evaluation.json.")],
     out: Annotated[Path | None, typer.Option(help="Folder of the repetition; a dated one when left out.")] = None,
     server: Annotated[
-        str | None,
-        typer.Option(help="Address of the card's policy server, host:port; optional on 127.0.0.1."),
+        str | None, typer.Option(help="Address of the card's policy server, host:port; optional on 127.0.0.1.")
     ] = None,
 ) -> int:
     """Repeat the evaluation of a card and compare every episode. Status 1: one ended differently."""

@@ -42,8 +42,7 @@ if TYPE_CHECKING:
 Settings = dict[str, Any]
 """Nested settings: name -> text of a command line, value of a file, or the settings of a section."""
 
-RECIPE, CONFIG_FILE = "config", "config_path"
-"""Our key and LeRobot's for a configuration file."""
+RECIPE, CONFIG_FILE = "config", "config_path"  # our key and LeRobot's for a configuration file
 DATASET = "dataset"
 PATH, TYPE, PACKAGES = "path", "type", "discover_packages_path"
 """Keys of a choice that LeRobot's parser reads besides its fields: ``--policy.type``."""
@@ -134,20 +133,13 @@ def is_of_benchmark(words: Mapping[str, str]) -> bool:
 
 @dataclass(frozen=True)
 class CommandSettings:
-    """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them.
+    """The settings of one of LeRobot's commands, as a command line and its configuration file ask for them."""
 
-    Attributes:
-        config: the command's configuration class.
-        words: LeRobot's full name of each setting on the command line -> its text or value.
-        file: settings of the configuration file. config_path: the file's path, or its repository.
-        begun: configuration of the training whose checkpoint is the file; None for other files.
-    """
-
-    config: type
-    words: Mapping[str, Any]
-    file: Settings = field(default_factory=dict)
-    config_path: str | None = None
-    begun: Any = None
+    config: type  # the command's configuration class
+    words: Mapping[str, Any]  # LeRobot's full name of each setting on the command line -> its text or value
+    file: Settings = field(default_factory=dict)  # settings of the configuration file
+    config_path: str | None = None  # path or repository of that file
+    begun: Any = None  # configuration of the training whose checkpoint the file is
 
     @cached_property
     def settings(self) -> Settings:
@@ -430,8 +422,7 @@ def _begun_training(config: Any, config_path: str | None) -> Any:
 # --- values of the fields of a configuration class ---
 
 PLAIN = {bool: "true or false", int: "a whole number", float: "a number"}
-NULLS = ("null", "~")
-"""Texts that stand for no value, as in YAML; for a number or a truth value also ``none``."""
+NULLS = ("null", "~")  # texts that stand for no value, as in YAML; for a number or a truth value also `none`
 
 
 def build_config(annotation: Any, settings: Any, key: str = "") -> Any:

@@ -20,10 +20,8 @@ from lerobot_memobench.conformance.subject import Actions, Subject
 from lerobot_memobench.envs.observations import reads_prompt
 from lerobot_memobench.errors import MemobenchError
 
-PROBED = 12
-"""Execution frames that are replaced, one at a time, to measure their effects."""
-COMPARED = 12
-"""Last plans of a stream that are compared with training, besides those at replaced frames."""
+PROBED = 12  # execution frames that are replaced, one at a time, to measure their effects
+COMPARED = 12  # last plans of a stream that are compared with training, besides those at replaced frames
 INTERVALS = (5, 7, 4)
 """Further intervals of plans for the check of frames between them; no stride within a stream is a multiple of all."""
 SHARE, LEAST = 0.01, {"float32": 2e-6, "other": 1e-2}
@@ -34,8 +32,7 @@ BY_ROW = "keep a history and an action queue for each row, and begin and plan by
 
 PASSED, FAILED, NO_MEMORY, NOT_CHECKED = "passed", "failed", "no memory", "not checked"
 
-CheckVerdict = tuple[str, str]
-"""An outcome, and a sentence with the problem and its solution."""
+CheckVerdict = tuple[str, str]  # an outcome, and a sentence with the problem and its solution
 
 
 @dataclass(frozen=True)

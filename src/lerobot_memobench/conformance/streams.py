@@ -26,8 +26,7 @@ TASK = "swap_the_objects_strictly_following_the_3-step_buffered_sequence_shown_i
 PROMPTS = (8, 11, 14)
 """Frames of each episode's prompt. They differ, so that the rows of a batch begin to act at different calls."""
 EXECUTION_FRAMES = 27
-THINGS = 4
-"""Objects of a synthetic scene."""
+THINGS = 4  # objects of a synthetic scene
 
 
 def write_streams(
@@ -95,16 +94,11 @@ def _images(rng: np.random.Generator, positions: NDArray[np.float32]) -> NDArray
 
 @dataclass(frozen=True)
 class Stream:
-    """Observations of one environment, call by call; a finished one repeats its last frame, as LeRobot's do.
+    """Observations of one environment, call by call; a finished one repeats its last frame, as LeRobot's do."""
 
-    Attributes:
-        frames: observations by their names at the policy, without a batch dimension.
-        task: the instruction. indices: of the frames in the dataset.
-    """
-
-    frames: tuple[dict[str, Tensor], ...]
-    task: str
-    indices: tuple[int, ...]
+    frames: tuple[dict[str, Tensor], ...]  # by the names at the policy, without a batch dimension
+    task: str  # the instruction
+    indices: tuple[int, ...]  # of the frames in the dataset
 
     def __len__(self) -> int:
         return len(self.frames)

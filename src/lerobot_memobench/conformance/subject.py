@@ -45,34 +45,25 @@ from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
 from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
 
-REPLAN = 3
-"""Default actions per chunk, so that a short stream has several chunks."""
-STREAMS = 3
-"""Number of episodes: a row, and two others in its batch."""
+REPLAN = 3  # default actions per chunk, so that a short stream has several chunks
+STREAMS = 3  # number of episodes: a row, and two others in its batch
 KEYS = ("policy", "dataset", "obs_type")
 
-Actions = NDArray[np.float32]
-"""Actions (calls, rows, A) of a policy."""
+Actions = NDArray[np.float32]  # actions (calls, rows, A) of a policy
 
 
 @dataclass
 class Subject:
-    """A policy with its processors, a dataset, and the observations of its episodes in a rollout.
-
-    Attributes:
-        dataset: samples as in training, with the policy's delta timestamps.
-        streams: `STREAMS` episodes. cameras: of the dataset.
-        numbers: (N,) index in ``dataset`` of each frame of the named dataset.
-    """
+    """A policy with its processors, a dataset, and the observations of its episodes in a rollout."""
 
     name: str
     policy: Any
     preprocessor: Any
     postprocessor: Any
-    dataset: Any
-    streams: list[Stream]
-    cameras: list[str]
-    numbers: NDArray[np.int64]
+    dataset: Any  # samples as in training, with the policy's delta timestamps
+    streams: list[Stream]  # `STREAMS` episodes
+    cameras: list[str]  # of the dataset
+    numbers: NDArray[np.int64]  # (N,) index in ``dataset`` of each frame of the named dataset
 
     def roll(self, streams: Sequence[Stream], *, equal_noise: bool = True, sparing: bool = False) -> Actions:
         """Reset the policy and let it act on streams, one row each, until the longest ends.

@@ -255,9 +255,10 @@ def inspect(file: SourceFile) -> Findings:
 
     try:
         with PublishedFile(file.path) as opened, refusing(_unusable):
-            announced, findings.groups = opened.announced(), opened.groups()
-            if announced not in (None, len(findings.groups)):
-                leave_out("data", f"its num_demos is {announced}, but there are {len(findings.groups)} demonstrations")
+            findings.groups = opened.groups()
+            if opened.announced not in (None, len(findings.groups)):
+                count = len(findings.groups)
+                leave_out("data", f"its num_demos is {opened.announced}, but there are {count} demonstrations")
             if not findings.groups:
                 leave_out("data", "it has no demonstrations")
             for group in findings.groups:

@@ -57,47 +57,30 @@ LanguageRow = dict[str, Any]
 class Demonstration:
     """One episode, T frames of it; frame t is the observation before ``actions[t]`` was applied.
 
-    Attributes:
-        task: the performed variant of the task: ``task.variant(k)`` for ``variant`` k > 0.
-        referent: ``"fixed"`` or ``"random"``; of a strict task ``"drawn"``.
-        variant: number of the requested referent or order; 0 is the published one.
-        states: (T, D) float64, the simulator's flattened state (1 + nq + nv).
-        actions: (T, 7) float32, OSC pose deltas and gripper: labels of the frames.
-        proprio: (T, 8) float32, end-effector position 3, axis-angle 3, gripper joints 2.
-        images: ``{"image", "wrist_image"}`` to (T, H, W, 3) uint8, or None.
-        exec_start: first frame of the execution; frames before it are the demonstration prompt and the rest after it,
-            whose actions are zeros.
-        satisfied: (T, K) bool, whether the predicate of checkpoint k is true at frame t; false in the prompt.
-            Predicates are evaluated after a control step, so frame ``exec_start`` (step 0) is false as well.
-        objects: (T, SIZE) float32, the visible objects (`sim.object_slots`).
-        fixture_poses: fixture name to (7,) position and quaternion wxyz.
-        scene_hash: hash of the initial scene, or empty.
-        stand_ins: classes of the scene whose missing scans this package's objects replaced.
-        executed: (T, 7) float32, the applied actions of a perturbed episode; None: ``actions``.
-        held: (T,) bool, whether the scene is held at frame t of the execution, so that its action, zeros, has no
-            effect; None: at no frame.
+    Frames before ``exec_start`` are the demonstration prompt and the rest after it, whose actions are zeros. Predicates
+    are evaluated after a control step of the execution, so ``satisfied`` is false in the prompt and at ``exec_start``.
 
     Raises:
-        MemobenchError: arrays have different lengths, or another type or width than stated above.
+        MemobenchError: arrays have different lengths, or another type or width than stated below.
     """
 
-    task: Task
+    task: Task  # the performed variant of the task: `task.variant(k)` for `variant` k > 0
     seed: int
-    referent: str
-    variant: int
-    states: NDArray[np.float64]
-    actions: NDArray[np.float32]
-    proprio: NDArray[np.float32]
-    images: dict[str, NDArray[np.uint8]] | None
-    exec_start: int
-    satisfied: NDArray[np.bool_]
+    referent: str  # "fixed" or "random"; of a strict task "drawn"
+    variant: int  # number of the requested referent or order; 0 is the published one
+    states: NDArray[np.float64]  # (T, D), the simulator's flattened state (1 + nq + nv)
+    actions: NDArray[np.float32]  # (T, 7), OSC pose deltas and gripper: labels of the frames
+    proprio: NDArray[np.float32]  # (T, 8), end-effector position 3, axis-angle 3, gripper joints 2
+    images: dict[str, NDArray[np.uint8]] | None  # "image" and "wrist_image" to (T, H, W, 3)
+    exec_start: int  # first frame of the execution
+    satisfied: NDArray[np.bool_]  # (T, K), whether the predicate of checkpoint k is true at frame t
     success: bool
-    objects: NDArray[np.float32]
-    fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    scene_hash: str = ""
-    stand_ins: tuple[str, ...] = ()
-    executed: NDArray[np.float32] | None = None
-    held: NDArray[np.bool_] | None = None
+    objects: NDArray[np.float32]  # (T, SIZE), the visible objects (`sim.object_slots`)
+    fixture_poses: dict[str, NDArray[np.float64]] = field(default_factory=dict)  # to (7,) position and quaternion wxyz
+    scene_hash: str = ""  # of the initial scene
+    stand_ins: tuple[str, ...] = ()  # classes of the scene whose missing scans this package's objects replaced
+    executed: NDArray[np.float32] | None = None  # (T, 7), the applied actions of a perturbed episode; None: `actions`
+    held: NDArray[np.bool_] | None = None  # (T,), whether the scene is held, so that the action, zeros, has no effect
 
     def __post_init__(self) -> None:
         for problem in self._problems():
@@ -128,7 +111,7 @@ class Demonstration:
         if not 0 <= self.exec_start < length:
             yield f"execution starts at frame {self.exec_start} of {length}; expected one of the episode's frames"
         if self.satisfied[: self.exec_start].any():
-            yield f"a checkpoint is satisfied in the prompt, before execution starts at frame {self.exec_start}"
+            yield f"a checkpoint is satisfied in the demonstration prompt, before frame {self.exec_start}"
 
     def __len__(self) -> int:
         """Return T, demonstration prompt included."""

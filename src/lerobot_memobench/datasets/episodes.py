@@ -149,11 +149,6 @@ class DemonstrationRecord(BaseModel):
     the frames' column `EPISODE_INFO`, at each episode's first frame. LeRobot's dataset tools (``lerobot-edit-dataset``)
     keep the columns of frames, but drop unknown columns of ``meta/episodes`` and unknown files. Manifest and dataset
     card are made of it; a field's description is its meaning in the card.
-
-    Attributes:
-        seed: -1 if unknown.
-        stand_ins: classes whose missing scans this package's objects replaced.
-        versions: versions of the packages on which the numbers depend; None if unknown.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -162,7 +157,7 @@ class DemonstrationRecord(BaseModel):
     memory_type: str = Field(description="temporal, spatial, object or procedural")
     family: str = Field(description="group of similar tasks")
     operations: str = Field(description="labels of the checkpoints in order, e.g. SUC")
-    seed: Whole = Field(description="seed of the scene")
+    seed: Whole = Field(description="seed of the scene")  # -1 if unknown
     referent: str = Field(
         description="fixed; random: the demonstration prompt decides the goal; drawn: the seed decides it "
         "(strict tasks)"
@@ -176,8 +171,8 @@ class DemonstrationRecord(BaseModel):
     fixture_poses: dict[str, list[Number]] = Field(description="JSON, fixture to position and quaternion wxyz")
     digest: str = Field(description="sha256 of states, actions and labels")
     world: Literal["libero"]
-    stand_ins: list[str]
-    versions: dict[str, str] | None = None
+    stand_ins: list[str]  # classes whose missing scans this package's objects replaced
+    versions: dict[str, str] | None = None  # of the packages on which the numbers depend
 
     @classmethod
     def meanings(cls) -> dict[str, str]:
@@ -307,17 +302,12 @@ STRANGER = (
 
 @dataclass(frozen=True)
 class ListedEpisode:
-    """An episode of a dataset, without its frames.
-
-    Attributes:
-        start: first frame in the dataset's global index.
-        record: None if this package wrote none.
-    """
+    """An episode of a dataset, without its frames."""
 
     index: int
-    start: int
+    start: int  # first frame in the dataset's global index
     length: int
-    record: DemonstrationRecord | None
+    record: DemonstrationRecord | None  # None if this package wrote none
 
 
 def list_episodes(folder: Path) -> list[ListedEpisode]:

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -25,21 +25,13 @@ _PLACE = ("index", "episode_index", "frame_index")
 
 @dataclass
 class FrameTable:
-    """Phases and texts of a dataset of E episodes and N frames.
+    """Phases and texts of a dataset of E episodes and N frames."""
 
-    Attributes:
-        episodes: (E + 1,) int64, first frame of each episode, and N.
-        phase: (N,) uint8.
-        held: (N,) bool, whether the scene is held in the execution.
-        subgoals: level to (N,) texts.
-        memory: (N,) oracle memory texts; None without this column.
-    """
-
-    episodes: np.ndarray
-    phase: np.ndarray
-    held: np.ndarray
-    subgoals: dict[str, list[str]]
-    memory: list[str] | None
+    episodes: np.ndarray  # (E + 1,) int64, first frame of each episode, and N
+    phase: np.ndarray  # (N,) uint8
+    held: np.ndarray  # (N,) bool, whether the scene is held in the execution
+    subgoals: dict[str, list[str]]  # level to (N,) texts
+    memory: list[str] | None  # (N,) oracle memory texts; None without this column
 
     @property
     def num_episodes(self) -> int:
@@ -90,17 +82,6 @@ def _resolve_subgoals(rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
     return resolved
 
 
-class TextEncoder(Protocol):
-    """Frozen text encoder: texts -> embeddings (N, dim) float32."""
-
-    @property
-    def dim(self) -> int:
-        """Width of an embedding."""
-
-    def __call__(self, texts: Sequence[str]) -> Tensor:
-        """Encode."""
-
-
 # --- lookup ---
 
 Columns = Mapping[str, Tensor]  # column -> its numbers (N, ...) of every frame, in the order of the global index
@@ -113,17 +94,6 @@ class FrameLookup:
     """Phase, texts, recorded numbers and remembered features of every frame of a dataset.
 
     1,500 episodes of 500 frames with the slots of objects take 0.7 GiB of main memory.
-
-    Args:
-        stride: distance between remembered frames.
-        texts: encoder of the subgoals; None: they have no embeddings.
-        remember: features of remembered frames; None: frames are not remembered.
-        columns: recorded numbers for training samples; None: LeRobot makes the samples.
-        encoded: name in a training sample -> features of the present frame.
-
-    Attributes:
-        runs: first frames of the parts of episodes between holds, and of the holds, and N.
-        texts, memories: distinct subgoals, whose embeddings are ``text_embeddings``, and distinct oracle memory texts.
     """
 
     def __init__(
@@ -131,23 +101,23 @@ class FrameLookup:
         root: Path,
         table: FrameTable,
         *,
-        stride: int = 1,
-        texts: TextEncoder | None = None,
-        remember: Remember | None = None,
-        columns: Columns | None = None,
-        encoded: Mapping[str, Encoded] | None = None,
+        stride: int = 1,  # distance between remembered frames
+        texts: Callable[[Sequence[str]], Tensor] | None = None,  # encoder of the subgoals; None: without embeddings
+        remember: Remember | None = None,  # None: frames are not remembered
+        columns: Columns | None = None,  # for training samples; None: LeRobot makes the samples
+        encoded: Mapping[str, Encoded] | None = None,  # name in a training sample -> features of the present frame
     ) -> None:
         self.root, self.stride = root, stride
         self.episodes, self.phase, self.acts = table.episodes, table.phase, table.acts
-        self.runs = table.runs(table.held)
+        self.runs = table.runs(table.held)  # first frames of the parts of episodes between holds, and of the holds
+        # Distinct subgoals, whose embeddings are `text_embeddings`; `memories` are the distinct oracle memory texts.
         self.texts = sorted({text for values in table.subgoals.values() for text in values if text})
         number = {text: row for row, text in enumerate(self.texts)}
         rows = {level: [number.get(text, -1) for text in values] for level, values in table.subgoals.items()}
         self._subgoal_rows = {
             level: _resolve_subgoals(np.array(column, np.int32), table.episodes) for level, column in rows.items()
         }
-        width = 0 if texts is None else texts.dim
-        self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0, width)
+        self.text_embeddings = texts(self.texts) if texts is not None and self.texts else torch.zeros(0)
         self.memories: list[str] = []
         self._memory_rows: np.ndarray | None = None
         if table.memory is not None:  # as objects: NumPy's own texts would each be as wide as the longest
@@ -241,23 +211,15 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
 
 
 class SamplesInMemory(Dataset[dict[str, Any]]):
-    """LeRobot's samples by their rows, from columns in main memory, without images.
-
-    Args:
-        columns: name -> numbers (N, ...).
-        bounds: first rows of the stretches in which a sample takes its other steps, and N.
-        steps: name of a column -> its steps in a sample, relative to the sample's row.
-        tasks: instructions by ``task_index``.
-        texts: name -> further values (N,).
-    """
+    """LeRobot's samples by their rows, from columns in main memory, without images."""
 
     def __init__(
         self,
-        columns: Mapping[str, Tensor],
-        bounds: np.ndarray,
-        steps: Mapping[str, Sequence[int]],
-        tasks: Sequence[str],
-        texts: Mapping[str, pa.Array] | None = None,
+        columns: Mapping[str, Tensor],  # name -> numbers (N, ...)
+        bounds: np.ndarray,  # first rows of the stretches in which a sample takes its other steps, and N
+        steps: Mapping[str, Sequence[int]],  # name of a column -> its steps in a sample, relative to the sample's row
+        tasks: Sequence[str],  # instructions by `task_index`
+        texts: Mapping[str, pa.Array] | None = None,  # name -> further values (N,)
     ) -> None:
         self._columns, self._texts, self._tasks = columns, texts or {}, tasks
         self._bounds = torch.from_numpy(bounds)

@@ -283,22 +283,14 @@ Images = dict[str, NDArray[np.uint8]]  # camera to a frame, (H, W, 3)
 
 @dataclass(frozen=True)
 class RecordingSettings:
-    """Settings of a demonstration besides task and seed.
+    """Settings of a demonstration besides task and seed."""
 
-    Attributes:
-        referent: ``"fixed"``, the task's own goal, or ``"random"``, the seed's; of a strict task ``"drawn"``.
-        image_size: height and width of images, pixels.
-        demonstration_prompt: whether the episode begins with the task's prompt, if it has one.
-        perturb: whether the arm is moved off its way at random (`Perturbation`).
-        convention: in which the images are written (`sim.convention`).
-    """
-
-    referent: str = "fixed"
+    referent: str = "fixed"  # the task's own goal, or "random": the seed's; of a strict task "drawn"
     images: bool = True
-    image_size: int = IMAGE_SIZE
-    demonstration_prompt: bool = True
-    perturb: bool = False
-    convention: str = UPRIGHT
+    image_size: int = IMAGE_SIZE  # height and width, pixels
+    demonstration_prompt: bool = True  # whether the episode begins with the task's prompt, if it has one
+    perturb: bool = False  # whether the arm is moved off its way at random (`Perturbation`)
+    convention: str = UPRIGHT  # in which the images are written (`sim.convention`)
 
 
 @lru_cache(maxsize=1)

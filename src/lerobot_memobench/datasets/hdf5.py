@@ -79,8 +79,11 @@ class PublishedFile:
             if not isinstance(data, h5py.Group):
                 raise MemobenchError(f"it has no group 'data' (found {', '.join(self._file) or 'none'})")
             self._data: h5py.Group = data
+            announced = data.attrs.get("num_demos")
+            self.announced = int(announced) if isinstance(announced, int | np.integer) else None
             self.bddl_name = _text_attribute(data, "bddl_file_name", required=True)
             self.bddl_text = _text_attribute(data, "bddl_file_content", required=True)
+            self.lacks_its_text = _is_file_object(self.bddl_text)
         except Exception as error:
             self._file.close()
             if isinstance(error, MemobenchError):
@@ -93,11 +96,6 @@ class PublishedFile:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    @property
-    def lacks_its_text(self) -> bool:
-        """Whether the task's text is replaced by the name of an open file."""
-        return _is_file_object(self.bddl_text)
-
     def attribute(self, name: str) -> str | None:
         """Return a text attribute of the group ``data``, or None."""
         return _text_attribute(self._data, name)
@@ -105,11 +103,6 @@ class PublishedFile:
     def groups(self) -> list[str]:
         """Return the names of the demonstrations, demo_2 before demo_10."""
         return sorted(self._data, key=lambda name: (demo_number(name) is None, demo_number(name) or 0, name))
-
-    def announced(self) -> int | None:
-        """Return ``num_demos``, the stated number of demonstrations, None where it is missing."""
-        value = self._data.attrs.get("num_demos")
-        return int(value) if isinstance(value, int | np.integer) else None
 
     @refusing(lambda why: MemobenchError(f"it cannot be read ({why})"))
     def read(self, name: str) -> PublishedDemo:

@@ -6,7 +6,7 @@ An episode's file names and bytes depend on the episode alone, never on the work
 
 ::
 
-    <staging>/episodes/000012/episode.json        identity, digest, statistics, hash of each file
+    <staging>/episodes/000012/episode.json        identity, digest, statistics
                               arrays.npz          states, actions, proprio, label columns (no pickle)
                               image.mp4, wrist_image.mp4
 
@@ -27,16 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from lerobot_memobench.constants import CAMERAS
 from lerobot_memobench.datasets.demonstration import Demonstration, LanguageRow, labels, persistent_rows
 from lerobot_memobench.datasets.episodes import DemonstrationRecord, check_whole, read_manifest
 from lerobot_memobench.datasets.layout import MANIFEST_FILE, STAGING, TOP_LEVEL, image_key, is_dataset
 from lerobot_memobench.datasets.video import ImageHistograms, Stats, VideoWriter
 from lerobot_memobench.errors import MemobenchError, short
-from lerobot_memobench.io import file_hash, flush_to_disk, refuse_links, remove_drafts, write_file
+from lerobot_memobench.io import flush_to_disk, refuse_links, remove_drafts, write_file
 from lerobot_memobench.jobs.processes import locked
 from lerobot_memobench.sim.convention import CONVENTIONS, UPRIGHT, in_convention
-from lerobot_memobench.untrusted import read_json
+from lerobot_memobench.untrusted import read_json, refusing
 
 TEMPORARY = ".tmp-"
 EPISODE_FILE = "episode.json"
@@ -51,19 +50,14 @@ ADVICE = "it is damaged; delete its folder and run the command again"
 class StagedEpisode(BaseModel):
     """``episode.json`` of a finished episode in ``folder``; arrays and videos are read on demand.
 
-    Attributes:
-        failure: why there is no demonstration of this seed, or None.
-        info: the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
-            episode at least its task's name and seed.
-        image_stats: name of a camera's video to the statistics of its pixels (`ImageHistograms`).
-        files: name to sha256 of the other files.
+    ``info`` is the episode's record (`DemonstrationRecord`), its ``language`` and number of ``frames``; of a failed
+    episode at least its task's name and seed.
     """
 
-    failure: str | None
+    failure: str | None  # why there is no demonstration of this seed
     info: dict[str, Any]
     language_persistent: list[LanguageRow]
-    image_stats: dict[str, dict[str, Any]]
-    files: dict[str, str]
+    image_stats: dict[str, dict[str, Any]]  # name of a camera's video to the statistics of its pixels
     folder: Path = Field(Path(), exclude=True)
 
     @property
@@ -88,19 +82,10 @@ class StagedEpisode(BaseModel):
 
     def arrays(self) -> dict[str, NDArray]:
         """Read states, actions, proprio and label columns; text columns are arrays of str."""
-        with np.load(self.folder / ARRAYS_FILE, allow_pickle=False) as data:
+        path = self.folder / ARRAYS_FILE
+        damaged = refusing(lambda why: MemobenchError(f"{path} cannot be read ({why}); {ADVICE}"))
+        with damaged, np.load(path, allow_pickle=False) as data:
             return dict(data)
-
-    def check(self) -> None:
-        """Raise a MemobenchError that names the first file whose hash differs from the recorded one."""
-        for name, expected in self.files.items():
-            path = self.folder / name
-            digest = file_hash(path) if path.is_file() else "missing"
-            if digest != expected:
-                raise MemobenchError(
-                    f"{path} is damaged (sha256 {digest[:12]}, written as {expected[:12]}); delete the folder "
-                    f"{self.folder} and repeat the command to make this episode again"
-                )
 
 
 def read_staged(folder: Path) -> StagedEpisode | None:
@@ -196,12 +181,7 @@ class EpisodeStage:
         self, info: dict[str, Any], failure: str | None, rows: list[LanguageRow], image_stats: dict[str, Any]
     ) -> StagedEpisode:
         episode = StagedEpisode(
-            failure=failure,
-            info=info,
-            language_persistent=rows,
-            image_stats=image_stats,
-            files={path.name: file_hash(path) for path in sorted(self._temporary.iterdir())},
-            folder=self._folder,
+            failure=failure, info=info, language_persistent=rows, image_stats=image_stats, folder=self._folder
         )
         (self._temporary / EPISODE_FILE).write_text(episode.model_dump_json())
         flush_to_disk(*self._temporary.iterdir(), self._temporary)  # a complete folder never has incomplete files
@@ -219,9 +199,9 @@ class EpisodeStage:
 def stage_demonstration(demo: Demonstration, folder: Path, convention: str = UPRIGHT) -> StagedEpisode:
     """Write a demonstration in memory, with its images, to ``folder``; an equal one that exists already is kept."""
     with EpisodeStage(folder, convention) as stage:
-        for frame in range(len(demo) if demo.images is not None else 0):
-            assert demo.images is not None
-            stage.add_images({camera: demo.images[camera][frame] for camera in CAMERAS})
+        images = demo.images or {}
+        for frames in zip(*images.values(), strict=True):
+            stage.add_images(dict(zip(images, frames, strict=True)))
         return stage.publish(demo)
 
 

@@ -103,9 +103,6 @@ def assemble(
         raise MemobenchError(
             f"some episodes for {out} have images and some have none, or others; record all of them with equal settings"
         )
-    for episode in written:
-        episode.check()
-
     build = out / STAGING / f"{TEMPORARY}dataset"
     shutil.rmtree(build, ignore_errors=True)
     versions = (manifest or {}).get("request", {}).get("versions")
@@ -186,7 +183,7 @@ def _write_frames(
     numbers: dict[str, list[NDArray]] = {}
     start = 0
     for number, (episode, videos) in enumerate(zip(episodes, _write_videos(meta, episodes), strict=True)):
-        if data.size() >= meta.data_files_size_in_mb * 1024**2:
+        if number and data.path.stat().st_size >= meta.data_files_size_in_mb * 1024**2:
             data.next(meta.chunks_size)
         if number and number % EPISODES_PER_STATES_FILE == 0:
             states.next(meta.chunks_size)
@@ -296,21 +293,20 @@ class ParquetFiles:
         self.build, self.template = build, template
         self.chunk, self.file = 0, 0
         self._writer: Any = None
-        self._path: Path | None = None
+
+    @property
+    def path(self) -> Path:
+        """The current file."""
+        return self.build / self.template.format(chunk_index=self.chunk, file_index=self.file)
 
     def write(self, table: pa.Table) -> None:
         """Append a row group to the current file."""
         import pyarrow.parquet as pq
 
         if self._writer is None:
-            self._path = self.build / self.template.format(chunk_index=self.chunk, file_index=self.file)
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy", use_dictionary=True)
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = pq.ParquetWriter(self.path, table.schema, compression="snappy", use_dictionary=True)
         self._writer.write_table(table)
-
-    def size(self) -> int:
-        """Return the bytes of the current file."""
-        return self._path.stat().st_size if self._path is not None else 0
 
     def next(self, chunks_size: int) -> None:
         """Begin the next file."""
@@ -323,7 +319,7 @@ class ParquetFiles:
         """End the current file."""
         if self._writer is not None:
             self._writer.close()
-            self._writer = self._path = None
+            self._writer = None
 
 
 # --- videos ---

@@ -62,18 +62,6 @@ class Episode:
     """An episode of one task; `reset` starts it for a seed.
 
     ``render``: size and quality of frames, None for those of ``settings``. ``changes`` replace settings by name.
-
-    Attributes:
-        task: the task of this episode: a variant if the referent is drawn.
-        step_index: control steps since the start of the episode, including the prompt.
-        exec_start: first frame of the execution; None before it.
-        progress: checkpoints and goal, in execution steps.
-        applied_action: action (7,) float32 executed in the last step.
-        rested: whether the last step was part of a pause or a hold: the scene was at rest and only the clock advanced.
-        fault: reason of an aborted execution, or None.
-        waits: whether other episodes are shown between prompt and execution.
-        corrupts: whether the memory is corrupted before the policy observes this frame. corrupted: whether it has been.
-        choice: the variant that the policy acts on; None outside evidence episodes.
     """
 
     def __init__(
@@ -99,14 +87,15 @@ class Episode:
         ``variant`` replaces the drawn one (evidence), and `choice` follows the policy's. ``keep_prompt``: cache it.
         """
         self.seed = int(seed)
-        self.fault: Fault | None = None
+        self.fault: Fault | None = None  # reason of an aborted execution
         if variant is None:
             drawn = self.referent != "fixed"
             task = referent_of(self.published, self.seed, self.settings.salt) if drawn else self.published
         else:
             task = self.published.variant(variant)
-        self.task = task
-        self.choice = None if variant is None else Choice(task)
+        self.task = task  # a variant if the referent is drawn
+        self.choice = None if variant is None else Choice(task)  # the variant that the policy acts on (evidence)
+        # Checkpoints and goal, in execution steps.
         if self.settings.rules == UPSTREAM:
             self.progress = Progress(task, UPSTREAM_EVALUATIONS)
             self.sim.reset(self.seed, self.progress.settle)
@@ -119,20 +108,22 @@ class Episode:
             self.sim.reset(self.seed, state=state)
         self.scene_hash = self.sim.scene_hash()
         self._start = self.sim.snapshot()
-        self.step_index = 0
-        self.exec_start: int | None = None
+        self.step_index = 0  # control steps since the start of the episode, including the prompt
+        self.exec_start: int | None = None  # first frame of the execution
         self.pacing = Pacing(self.settings, self._rng(4))
-        self.rested = False
+        self.rested = False  # whether the last step was part of a pause or a hold: only the clock advanced
         self._event, self._holds = False, self.draw_holds()
-        self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)
-        self.prompt_shown: bool | None = None
-        self.drifted = False
+        self.applied_action: NDArray[np.float32] = np.zeros(ACTION_DIM, np.float32)  # in the last step
+        self.prompt_shown: bool | None = None  # whether the prompt has succeeded
+        self.drifted = False  # whether one of the wrong atoms has held
         self._wrong_atoms: list[Atom] = []
         self._expert: Expert | None = None
         self._blind: Iterator[NDArray[np.float32]] | None = None
         self._prompt: PromptPlayer | None = None
         self._reshows = self.settings.reshow
+        # Whether the memory is corrupted before the policy observes this frame, and whether it has been.
         self.corrupts = self.corrupted = False
+        # Whether other episodes are shown now, and whether some follow the prompt.
         self.waits, self._interrupts = False, self.settings.interference > 0
         self._keeps_prompt = keep_prompt
         if self.demonstration_prompt or (task.prompt is not None and not task.prompt.restores):

@@ -35,8 +35,7 @@ MERGED_FILE = "episodes.jsonl"
 WRITTEN_AT = "written_at"
 """Key in the workers' files only: time of writing, s since 1970. The newest of several lines counts."""
 
-Key = tuple[str, int]
-"""Identity of an episode in its evaluation: task and number."""
+Key = tuple[str, int]  # identity of an episode in its evaluation: task and number
 
 # --- lines ---
 
@@ -231,17 +230,14 @@ def line_of(record: Mapping[str, Any]) -> dict[str, Any]:
 # --- reading ---
 
 
-def read_episodes(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
-    """Return the rollouts logged in ``directory``, see `read_log`; ``problems`` also names episodes not run."""
-    records = read_log(directory, problems)
-    if problems is not None:
-        problems += notes_on_not_run(records)
-    return [record for record in records if "not_run" not in record]
+def read_episodes(directory: str | Path) -> list[dict[str, Any]]:
+    """Return the rollouts logged in ``directory``, see `read_log`."""
+    return [record for record in read_log(directory) if "not_run" not in record]
 
 
-def read_log(directory: str | Path, problems: list[str] | None = None) -> list[dict[str, Any]]:
+def read_log(directory: str | Path) -> list[dict[str, Any]]:
     """Return all episodes logged in ``directory`` (`read_lines`), each with the facts of the evaluation's file."""
-    lines = read_lines(directory, problems)
+    lines = read_lines(directory)
     return joined(Path(directory), read_evaluation(Path(directory)), lines)
 
 
@@ -315,8 +311,9 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
         )
     if problems is not None:
         problems += faults
-    for fault in faults if problems is None else ():
-        logger.warning("%s", fault)
+    else:
+        for fault in faults:
+            logger.warning("%s", fault)
     return [{name: value for name, value in newest[key].items() if name != WRITTEN_AT} for key in sorted(newest)]
 
 

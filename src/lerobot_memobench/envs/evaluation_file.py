@@ -29,8 +29,7 @@ EXTENT = ("tasks", "episodes")
 OF_ONE_EVALUATION = ("prompt_in", "window_steps", "delay_steps", "camera_name_mapping", "robot_state", INPUTS, "salt")
 """Settings that follow from the policy, and the salt, which the start of a sealed evaluation draws. They may differ
 between compared evaluations, not between parts of one."""
-MOST_EPISODES = 100_000
-"""Largest number of episodes of one task; bounds the memory that a damaged file can request."""
+MOST_EPISODES = 100_000  # largest number of episodes of one task; bounds the memory that a damaged file can request
 
 
 @dataclass(frozen=True)

@@ -61,16 +61,21 @@ UNKNOWN_PLAN = (
 """Message of a refusal, without the setting's name."""
 
 
+def lerobots_command() -> str | None:
+    """Return ``eval`` or ``train`` in the process of ``lerobot-eval`` or ``lerobot-train``, None in any other."""
+    name = Path(sys.argv[0]).stem.replace("_", "-")  # `lerobot_eval.py` of `python -m` too
+    return name.removeprefix("lerobot-") if name in ("lerobot-eval", "lerobot-train") else None
+
+
 @contextmanager
 def ending_lerobots_command() -> Iterator[None]:
     """End ``lerobot-eval`` and ``lerobot-train`` with the message of a `MemobenchError`, as this package's commands."""
     try:
         yield
     except MemobenchError as error:
-        command = Path(sys.argv[0]).stem.replace("_", "-")
-        if command not in ("lerobot-eval", "lerobot-train"):
+        if (command := lerobots_command()) is None:
             raise
-        print(f"{command}: {error}", file=sys.stderr)
+        print(f"lerobot-{command}: {error}", file=sys.stderr)
         raise SystemExit(2) from error
 
 
@@ -198,7 +203,7 @@ class MemobenchEnvConfig(_WithSettings):
 
     def _number_as_lerobot(self) -> None:
         """Let the first episode of ``lerobot-eval`` in a suite of LIBERO have the first initial state."""
-        if self.suite not in LIBERO_SUITES or "eval" not in Path(sys.argv[0]).name:
+        if self.suite not in LIBERO_SUITES or lerobots_command() != "eval":
             return
         from lerobot.configs.default import EvalConfig
         from lerobot.configs.eval import EvalPipelineConfig

@@ -33,8 +33,7 @@ ROBOT_STATE: dict[str, dict[str, tuple[int, ...]]] = {
 """Shapes of ``robot_state``, see `Simulation.robot_state`."""
 
 SPARSE, CHECKPOINTS = "sparse", "checkpoints"
-REWARDS = (SPARSE, CHECKPOINTS)
-"""Values of ``reward``; see `env.MemobenchEnv`."""
+REWARDS = (SPARSE, CHECKPOINTS)  # values of `reward`; see `env.MemobenchEnv`
 
 METADATA: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
 

@@ -20,10 +20,8 @@ from lerobot_memobench.constants import LONGEST_HOLD, MOST_HOLDS
 from lerobot_memobench.envs.settings import EnvSettings, steps_per_action
 from lerobot_memobench.tasks.task import STRICT
 
-STEPS_BETWEEN_PAUSES = (20, 120)
-"""Smallest and largest number of execution steps between two pauses, drawn uniformly."""
-FEWEST_STEPS_AWAY = 2
-"""Smallest number of execution steps between two holds: the hand leaves home and returns."""
+STEPS_BETWEEN_PAUSES = (20, 120)  # smallest and largest number of execution steps between two pauses, drawn uniformly
+FEWEST_STEPS_AWAY = 2  # smallest number of execution steps between two holds: the hand leaves home and returns
 
 
 class Pacing:

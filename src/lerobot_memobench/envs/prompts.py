@@ -40,8 +40,7 @@ class PromptPlayer:
 
     over = False
     succeeded = False
-    observed = True
-    """Whether frames before the end are read; if not, a restored prompt skips them."""
+    observed = True  # whether frames before the end are read; if not, a restored prompt skips them
 
     def __init__(self, demonstrator: PromptDemonstrator, sim: Simulation, longest: int, file: Path | None) -> None:
         self._demonstrator, self._sim, self._longest, self._file = demonstrator, sim, longest, file

@@ -40,8 +40,7 @@ from lerobot_memobench.tasks.task import (
 )
 
 PIXELS, OBJECTS, BOTH = "pixels_agent_pos", "environment_state_agent_pos", "both"
-OBS_TYPES = (PIXELS, OBJECTS, BOTH)
-"""Values of ``obs_type``; the first two are LeRobot's names."""
+OBS_TYPES = (PIXELS, OBJECTS, BOTH)  # values of `obs_type`; the first two are LeRobot's names
 
 AUTO, STEPS, RESET = "auto", "steps", "reset"
 PROMPT_IN = (AUTO, STEPS, RESET)
@@ -51,34 +50,27 @@ policies the prompt plays in `reset`. ``auto`` chooses by the policy; without a 
 
 RELATIVE = "relative"
 QUALITIES = ("default", "high")
-EVERY = -1
-"""Value of ``videos``: record every episode."""
-SLOWEST = 10
-"""Maximum number of control steps per action, see ``speed``."""
+EVERY = -1  # value of `videos`: record every episode
+SLOWEST = 10  # maximum number of control steps per action, see `speed`
 
-SMALLEST, LARGEST = 16, 2048
-"""Least and greatest height and width of images, pixels."""
+SMALLEST, LARGEST = 16, 2048  # least and greatest height and width of images, pixels
 
-EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'
-"""A value of ``camera_name_mapping``."""
+EXAMPLE = '{"agentview_image": "camera1", "robot0_eye_in_hand_image": "camera2"}'  # a value of `camera_name_mapping`
 IMAGE_NAME = re.compile("[A-Za-z0-9_]+")
 
 SALT = re.compile("[0-9a-f]{32}")
 INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
-CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)
-"""Values of ``corrupt``: what happens to the memory of the policy."""
+CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)  # values of `corrupt`: what happens to the memory of the policy
 
 IMAGE_SETTINGS = {"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
 """Settings of images, with the values that a log omits."""
-MEMORY_CONTROLS: Mapping[str, Any] = {"corrupt": INTACT, "corrupt_step": 0, "reshow": False, "interference": 0}
-"""Settings of corruption and interference, with their values in the protocol."""
+MEMORY_CONTROLS = ("corrupt", "corrupt_step", "reshow", "interference")  # settings of corruption and interference
 
 HOLD, GOALS, STRICT_GOALS = "hold", "goals", 4
 """Protocol keys of strict tasks: mean control steps of a hold, and revision of the goals. Goals of revision 1 could be
 reached without memory by marks in the scene and a clock, goals of revision 2 by a camera inside a drawer and by a plan
 that passes home, goals of revision 3 by a clock, because returns without an event were held."""
-SCENE_HASHES = "scene_hash_version"
-"""Protocol key: version of the hash of scenes (`sim.scene_hash`)."""
+SCENE_HASHES = "scene_hash_version"  # protocol key: version of the hash of scenes (`sim.scene_hash`)
 UPSTREAM_ONLY = ("suite", "referent", "oracle_memory", "pause_steps", "speed", "evidence", *MEMORY_CONTROLS)
 """Settings that keep their default in the authors' evaluation."""
 LIBERO_ONLY = (
@@ -167,10 +159,7 @@ class EnvSettings:
         usual="the policy's",
     )
     window_steps: int = setting(
-        1,
-        "control steps of observations in an input of a policy without a memory",
-        least=1,
-        usual="the policy's",
+        1, "control steps of observations in an input of a policy without a memory", least=1, usual="the policy's"
     )
     delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
     render: str = setting("default", "high is for figures and four times slower", QUALITIES)
@@ -206,6 +195,7 @@ class EnvSettings:
     )
 
     def __post_init__(self) -> None:
+        # By `vars`, because the class is frozen.
         vars(self).update({name: value for name, value in self.usual.items() if getattr(self, name) is None})
         for setting in fields(self):
             self._check(setting.name, str(setting.type), setting.metadata)
@@ -348,8 +338,7 @@ class EnvSettings:
         return {**agreed, SCENE_HASHES: SCENE_HASH_VERSION, **strict}
 
 
-NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")
-"""Settings without effect on rollouts."""
+NOT_COMPARED = ("control_mode", "expert_action", "blind_action", "videos")  # settings without effect on rollouts
 SETTINGS = tuple(setting.name for setting in fields(EnvSettings) if setting.name not in NOT_COMPARED)
 """Settings with an effect on rollouts."""
 

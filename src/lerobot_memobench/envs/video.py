@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 
     from lerobot_memobench.envs.episode import Episode
 
-BAND, MARGIN = 64, 8
-"""Height of the text above the images, and margin at its sides, pixels."""
-CLOCK, CLOCK_BOTTOM = 96, 24
-"""Width reserved for the clock, and its lower edge from the top, pixels."""
+BAND, MARGIN = 64, 8  # height of the text above the images, and margin at its sides, pixels
+CLOCK, CLOCK_BOTTOM = 96, 24  # width reserved for the clock, and its lower edge from the top, pixels
 _BACKGROUND, _TEXT, _FAINT = (24, 26, 30), (240, 240, 240), (150, 155, 165)
 OPERATION_COLOURS = {"S": (86, 180, 233), "U": (230, 159, 0), "C": (0, 158, 115)}
 """Storage, Update, Compression in Okabe and Ito's palette, which colour-blind readers can distinguish."""
@@ -107,8 +105,7 @@ def _draw_checkpoint(draw: ImageDraw.ImageDraw, x: int, operation: str, *, done:
 
 # --- writing ---
 
-LAST_FRAMES = 20
-"""Repetitions of the final frame: one second."""
+LAST_FRAMES = 20  # repetitions of the final frame: one second
 
 
 class _DiscardedError(Exception):

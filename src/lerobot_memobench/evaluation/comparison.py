@@ -156,7 +156,7 @@ def control_between(a: Run, b: Run) -> Control | None:
             )
         for key in ("type", "sha256") if control.one_policy else ():
             of_a, of_b = (run.protocol[POLICY].get(key) for run in (a, b))
-            if of_a and of_b and of_a != of_b:
+            if of_a and of_b and of_a != of_b:  # an unknown policy may be the same
                 raise MemobenchError(
                     f"{a.folder} and {b.folder} are of two policies ({key} {str(of_a)[:12]} and {str(of_b)[:12]}); "
                     "expected one policy with and without the control"
@@ -293,7 +293,7 @@ def compare_evaluations(
     control = control_between(a, b)
     allowed = {*allow, *([] if control is None or control.of_policy else [control.setting, *control.also])}
     if other_hashes(a.protocol, b.protocol):
-        allowed.add(SCENES)
+        allowed.add(SCENES)  # two versions hash the same scene differently
     pairs = _paired(a, b, allowed)
     reported = {} if control is None else {"by_checkpoint": control.by_checkpoint, "closes": control.gap_closed}
     contrasts = contrasts_of(pairs, np.random.default_rng(seed), permutations, **reported)

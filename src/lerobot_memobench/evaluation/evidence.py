@@ -166,7 +166,6 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
 
 def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     """Return the mean over groups of the means over their tasks, with intervals over scenes."""
-
     tasks = [task for group in groups for task in group]
     rates = nested_mean([[task.values.mean(axis=0) for task in group] for group in groups])
     drawn = nested_mean([[task.values[task.drawn].mean(axis=1) for task in group] for group in groups])
@@ -175,6 +174,7 @@ def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
     estimates = {name: _estimate(rates[k], drawn[:, k], scenes) for k, name in enumerate((*RATES, RELIABLE))}
     decided, of_draws = 1 - rates[2], 1 - drawn[:, 2]
     if decided > 0:
+        # A draw without any answer has no such rate.
         right = drawn[of_draws > 0, 0] / of_draws[of_draws > 0]
         estimates[RIGHT] = _estimate(rates[0] / decided, right, max(1.0, scenes * decided))
     alone = len(tasks) == 1

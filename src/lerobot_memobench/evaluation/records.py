@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from lerobot_memobench.constants import PAPER, SPLITS
 from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
@@ -29,41 +29,29 @@ from lerobot_memobench.tasks.task import LIBERO_SUITES, PUBLISHED
 # --- extent ---
 
 
-class Extent(NamedTuple):
-    """The episodes that an evaluation's file requests; ``shard`` is its part of an evaluation, such as ``1/8``."""
-
-    tasks: Sequence[str]
-    episodes: range
-    shard: str | None
-
-    def includes(self, record: Record) -> bool:
-        """Return whether the episode of a line was requested."""
-        return record["task"] in self.tasks and record["episode"] in self.episodes
-
-    def missing(self, lines: Iterable[Record]) -> str | None:
-        """Return a sentence on the episodes without a line, None without such episodes."""
-        logged = {(line["task"], line["episode"]) for line in lines if self.includes(line)}
-        total = len(self.tasks) * len(self.episodes)
-        if len(logged) == total:
-            return None
-        task, episode = next(key for key in itertools.product(self.tasks, self.episodes) if key not in logged)
-        unrun = len(self.tasks) - len({name for name, _ in logged})
-        return (
-            f"missing: {total - len(logged):,} of {count_of(total, 'episode')}"
-            f"{f', with all of {count_of(unrun, "task")}' if unrun else ''}, the first is {task}, episode {episode}"
-            f"{f', in part {self.shard} of an evaluation' if self.shard else ''}; run the same command, or the missing "
-            "parts, with resume=true"
-        )
-
-
-def extent_of(card: Mapping[str, Any]) -> Extent | None:
-    """Return the episodes that an evaluation's file asks for, None where LeRobot's own commands wrote it."""
+def _requested(card: Mapping[str, Any]) -> tuple[list[str], range] | None:
+    """Return the tasks and episode numbers that a file asks for, None where LeRobot's own commands wrote it."""
     protocol = card["protocol"]
     if not {*EXTENT} <= {*protocol}:
         return None
     seed, base = card[POLICY].get("seed"), protocol.get("seed_base")
     first = seed - base if isinstance(seed, int) and isinstance(base, int) else 0
-    return Extent(sorted({*protocol["tasks"]}), range(first, first + protocol["episodes"]), card.get("shard"))
+    return sorted({*protocol["tasks"]}), range(first, first + protocol["episodes"])
+
+
+def _missing(tasks: Sequence[str], episodes: range, records: Iterable[Record], shard: str | None) -> str | None:
+    """Return a sentence on the requested episodes without a record, None without such episodes."""
+    logged, total = set(map(key_of, records)), len(tasks) * len(episodes)
+    if len(logged) == total:
+        return None
+    task, episode = next(key for key in itertools.product(tasks, episodes) if key not in logged)
+    unrun = len(tasks) - len({name for name, _ in logged})
+    return (
+        f"missing: {total - len(logged):,} of {count_of(total, 'episode')}"
+        f"{f', with all of {count_of(unrun, "task")}' if unrun else ''}, the first is {task}, episode {episode}"
+        f"{f', in part {shard} of an evaluation' if shard else ''}; run the same command, or the missing parts, with "
+        "resume=true"
+    )
 
 
 # --- evaluations ---
@@ -138,6 +126,7 @@ def read_runs(words: Sequence[str | Path]) -> list[Run]:
     names = folder_names([folder for _, folder in labelled])
     runs = []
     for (label, folder), name in zip(labelled, names, strict=True):
+        # An evaluation of several suites has a folder of each.
         suites = [] if has_log(folder) else [suite for suite in LIBERO_SUITES if has_log(folder / suite)]
         runs.append(_joined([read_run(folder / suite, name, label or "") for suite in suites or ("",)]))
     first = runs[0].suites[0]
@@ -160,7 +149,7 @@ def _joined(parts: Sequence[Run]) -> Run:
     if len(parts) == 1:
         return parts[0]
     parts = sorted(parts, key=lambda part: GROUPS.index(part.suites[0]))
-    for a, b in pairwise(parts):
+    for a, b in pairwise(parts):  # in the order of suites, equal ones are neighbours
         if a.suites == b.suites or _policy(a) != _policy(b):
             same = f"the suite {a.suites[0]}" if a.suites == b.suites else "other policies"
             raise MemobenchError(
@@ -248,11 +237,13 @@ def run_of(
 ) -> Run:
     """Return the evaluation in a folder, given the lines of its log and the notes of reading them; see `read_run`."""
     card, notes = read_evaluation(folder), [*notes]
-    extent, records = extent_of(card), joined(folder, card, lines)
-    records = [record for record in records if extent is None or extent.includes(record)]
+    records, missing = joined(folder, card, lines), None
+    if requested := _requested(card):
+        tasks, episodes = requested
+        records = [record for record in records if record["task"] in tasks and record["episode"] in episodes]
+        missing = _missing(tasks, episodes, records, card.get("shard"))
     if len(records) < len(lines):
         notes.append(f"{count_of(len(lines) - len(records), 'rollout')} beyond those that were asked for left out")
-    missing = None if extent is None else extent.missing(records)
     notes += [*([] if missing is None else [missing]), *notes_on_not_run(records)]
     unrun = {task: len(group) for task, group in not_run(records).items()}
     # A file that requests no episodes has the extent of its log; larger numbers are damage.

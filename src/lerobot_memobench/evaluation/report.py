@@ -64,7 +64,7 @@ def write_report(directory: str | Path) -> Run:
     directory, notes = Path(directory), list[str]()
     lines = read_lines(directory, notes)
     run = run_of(directory, lines, notes)
-    write_episodes(directory, lines)
+    write_episodes(directory, lines)  # also those that were not asked for
     values = {**report_values(run.summary), **evidence_values(run)}
     if run.not_run:
         values["not_run"] = run.not_run

@@ -450,7 +450,7 @@ def _csv_rows(table: Table) -> list[dict[str, object]]:
         for column, (name, cell) in enumerate(zip(table.names, row, strict=True)):
             if isinstance(cell, PrefixRates):
                 values |= {f"{name} {order.replace('_', ' ')}": percent(r.value) for order, r in cell._asdict().items()}
-            elif column in rates:
+            elif column in rates:  # its bounds are columns where no rate applies, too
                 rate = cell if isinstance(cell, Rate) else Rate(None, 0)
                 low, high = rate.interval or (None, None)
                 values |= {name: percent(rate.value), f"{name} low": percent(low), f"{name} high": percent(high)}

@@ -251,7 +251,7 @@ class Expert:
         if self.sim.world.articulation(name)[0].kind != "door":
             return (fixtures.open_drawer if opening else fixtures.close_drawer)(self.hand, name)
         if self.task.suite == STRICT:  # not `Hand.strict`: the blind routine solves a published task in a strict scene
-            return (fixtures.sweep_door_open if opening else fixtures.sweep_door_shut)(self.hand, name)
+            return fixtures.sweep_door(self.hand, name, opening)
         return (fixtures.open_door if opening else fixtures.close_door)(self.hand, name)
 
     def _put_in(self, name: str, region: str) -> Steps:

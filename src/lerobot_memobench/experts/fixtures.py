@@ -280,8 +280,9 @@ def door_geometry(hand: Hand, name: str, ahead: float = 0.0) -> Door:
     return Door(q + ahead, handle, turned(outward), turned(along), edge)
 
 
-def door_is_at_goal(q: float, articulation: Articulation, opening: bool) -> bool:
+def door_is_at_goal(hand: Hand, name: str, opening: bool) -> bool:
     """Return whether a door is open, or closed, with a margin."""
+    articulation, q = hand.sim.world.articulation(name)
     return q < articulation.open_below - 0.015 if opening else q > articulation.closed_above + 0.002
 
 
@@ -327,7 +328,7 @@ def _pull_door(hand: Hand, name: str) -> Steps:
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(160):
         door = door_geometry(hand, name)
-        if door_is_at_goal(door.q, articulation, opening=True) or distance_from_base(door.handle) > DOWNWARD_REACH:
+        if door_is_at_goal(hand, name, opening=True) or distance_from_base(door.handle) > DOWNWARD_REACH:
             break
         if hand.empty or length(hand.position - door.handle - up) > DROP_DISTANCE:
             break
@@ -358,15 +359,15 @@ def _swing_door(hand: Hand, name: str, opening: bool) -> Steps:
     yield from hand.close()
     for _ in range(160):
         door = door_geometry(hand, name)
-        if _swing_is_over(hand, door, articulation, opening):
+        if _swing_is_over(hand, name, door, opening):
             break
         lead = way * min(SWING_LEAD, abs(goal - door.q) + end_lead)
         yield hand.toward(at(-DOOR_EDGE_DEPTH, lead)(), turned(lead / 2), CLOSED, speed=0.8)
     yield from release_fixture(hand)
 
 
-def _swing_is_over(hand: Hand, door: Door, articulation: Articulation, opening: bool) -> bool:
-    if door_is_at_goal(door.q, articulation, opening):
+def _swing_is_over(hand: Hand, name: str, door: Door, opening: bool) -> bool:
+    if door_is_at_goal(hand, name, opening):
         return True
     if not opening and distance_from_base(door.handle + PUSH_GAP * door.outward) < DOWNWARD_REACH - 0.04:
         return True
@@ -388,7 +389,7 @@ def _push_door(hand: Hand, name: str) -> Steps:
     yield from rise(hand, CLOSED, 0.26)
     yield from hand.move(lambda: at(PUSH_GAP, 0.15), turned, CLOSED, tolerance=0.02, turn_tolerance=0.1)
     yield from hand.move(lambda: at(PUSH_GAP), turned, CLOSED, tolerance=0.012, turn_tolerance=0.1)
-    shut = sustained(lambda: door_is_at_goal(_joint_position(hand, name), articulation, opening=False))
+    shut = sustained(lambda: door_is_at_goal(hand, name, opening=False))
     for _ in range(160):
         if shut():
             break
@@ -405,22 +406,11 @@ def _push_door(hand: Hand, name: str) -> Steps:
 # the door moves; in the published demonstrations it releases the door and grasps it again ---
 
 
-def sweep_door_open(hand: Hand, name: str) -> Steps:
-    """Grasp a door's handle and follow the arc until the door counts as open."""
-    articulation, _ = hand.sim.world.articulation(name)
+def sweep_door(hand: Hand, name: str, opening: bool) -> Steps:
+    """Grasp a door's handle and follow the arc until the door is open, or push its panel until it is closed."""
     for _ in range(MAX_ATTEMPTS):
-        yield from _sweep_open(hand, name)
-        yield from release_fixture(hand, 0.08)
-        if door_is_at_goal(_joint_position(hand, name), articulation, opening=True):
-            return
-
-
-def sweep_door_shut(hand: Hand, name: str) -> Steps:
-    """Push a door's panel from outside until the door is closed."""
-    articulation, _ = hand.sim.world.articulation(name)
-    for _ in range(MAX_ATTEMPTS):
-        yield from _sweep_shut(hand, name)
-        if door_is_at_goal(_joint_position(hand, name), articulation, opening=False):
+        yield from (_sweep_open if opening else _sweep_shut)(hand, name)
+        if door_is_at_goal(hand, name, opening):
             return
 
 
@@ -447,10 +437,10 @@ def _sweep_open(hand: Hand, name: str) -> Steps:
     yield from hand.close()
     way = np.sign(articulation.open_q - articulation.closed_q)
     for _ in range(MAX_SWEEP_STEPS):
-        opened = door_is_at_goal(_joint_position(hand, name), articulation, opening=True)
-        if opened or length(hand.position - grip()[0]) > DROP_DISTANCE:
+        if door_is_at_goal(hand, name, opening=True) or length(hand.position - grip()[0]) > DROP_DISTANCE:
             break
         yield hand.toward(*grip(way * SWEEP_LEAD), CLOSED)
+    yield from release_fixture(hand, 0.08)
 
 
 def _sweep_shut(hand: Hand, name: str) -> Steps:
@@ -467,7 +457,7 @@ def _sweep_shut(hand: Hand, name: str) -> Steps:
     for height, tolerance in ((0.12, 0.03), (0.0, 0.02)):
         target, turn = pose(PANEL_APPROACH_GAP, height)
         yield from hand.move(target, turn, CLOSED, tolerance=tolerance, turn_tolerance=0.15)
-    shut = sustained(lambda: door_is_at_goal(_joint_position(hand, name), articulation, opening=False))
+    shut = sustained(lambda: door_is_at_goal(hand, name, opening=False))
     for _ in range(MAX_SWEEP_STEPS):
         if shut() or length(hand.position - pose(PANEL_CONTACT_GAP)[0]) > DROP_DISTANCE + PANEL_APPROACH_GAP:
             break

@@ -79,22 +79,14 @@ that kind in that cell. Querying few cells is much faster than predicting all ki
 
 @dataclass(frozen=True)
 class DetectorOutput:
-    """Predictions of heads for images.
+    """Predictions of heads for images."""
 
-    Attributes:
-        heatmap: (N, kinds, cells, cells), logits of an object's visible centre.
-        geometry: len(GEOMETRY) values. side: coarse cells along the image's side.
-        mask: (N, kinds + 1, cells, cells), logits of the visible kind; the first is background.
-        uncertainty: len(UNCERTAINTIES) values, logarithms of the geometry's expected errors; None: not predicted.
-        score: a logit per kind of an object at a peak of the heat map; None: not refined.
-    """
-
-    heatmap: Tensor
-    geometry: CellQuery
-    side: int
-    mask: Tensor
-    uncertainty: CellQuery | None = None
-    score: CellQuery | None = None
+    heatmap: Tensor  # (N, kinds, cells, cells), logits of an object's visible centre
+    geometry: CellQuery  # len(GEOMETRY) values
+    side: int  # coarse cells along the image's side
+    mask: Tensor  # (N, kinds + 1, cells, cells), logits of the visible kind; the first is background
+    uncertainty: CellQuery | None = None  # logarithms of `UNCERTAINTIES`; None: not predicted
+    score: CellQuery | None = None  # a logit per kind of an object at a peak of the heat map; None: not refined
 
 
 class Detector(nn.Module):

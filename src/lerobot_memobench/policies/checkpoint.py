@@ -22,8 +22,7 @@ from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import LONGEST_NAME, file_hash, file_name
-from lerobot_memobench.untrusted import Count, check_fetched, refusing
-from lerobot_memobench.untrusted import read_json as read_json_file
+from lerobot_memobench.untrusted import Count, check_fetched, read_json, refusing
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -199,12 +198,11 @@ def checkpoint_type(path: str) -> str:
 def read_checkpoint_json(path: Path, schema: Any = dict[str, Any]) -> dict[str, Any]:
     """Return the object in a JSON file of a checkpoint; raise `MemobenchError` if it is missing, or not of a schema."""
     try:
-        content: dict[str, Any] = read_json_file(path, schema, ADVICE)
+        return read_json(path, schema, ADVICE)
     except FileNotFoundError:
         raise MemobenchError(
             f"{path} is missing; expected a complete checkpoint folder as lerobot-train saves it"
         ) from None
-    return content
 
 
 def check_checkpoint(path: str) -> None:
@@ -422,7 +420,7 @@ def _as_loaded(policy: Any, shapes: dict[str, tuple[int, ...]]) -> dict[str, tup
     import torch
 
     rename = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if rename is None or type(policy).__module__.startswith(f"{__package__}."):
+    if rename is None:
         return shapes
     tensors = rename({name: torch.empty(shape, device="meta") for name, shape in shapes.items()}, policy.config)
     return {f"model.{name.removeprefix('model.')}": tuple(tensor.shape) for name, tensor in tensors.items()}
@@ -458,8 +456,7 @@ def trained_names(source: str | Path) -> dict[str, str]:
 
 def processor_steps(file: Path | None) -> list[SavedStep]:
     """Return the steps in the file of a processor; none without a file."""
-    steps: list[SavedStep] = [] if file is None else read_checkpoint_json(file, _Processor).get("steps", [])
-    return steps
+    return [] if file is None else read_checkpoint_json(file, _Processor).get("steps", [])
 
 
 def _normalises(step: SavedStep) -> bool:
@@ -508,9 +505,7 @@ def encoded_config(policy: Any) -> dict[str, Any]:
     """Return a policy's configuration as plain JSON values."""
     import draccus
 
-    values = json.loads(json.dumps(draccus.encode(policy), default=str))
-    assert isinstance(values, dict)
-    return {**values, "type": policy.type}
+    return {**json.loads(json.dumps(draccus.encode(policy), default=str)), "type": policy.type}
 
 
 def check_sizes(policy: Any) -> None:

@@ -98,15 +98,12 @@ class RemoteConfig(UntrainedConfig):
                 raise MemobenchError(f"policy.{name} is {value!r}, {nearest(value, known)}")
         if self.n_action_steps is BY_DIALECT:
             self.n_action_steps = self.connection.n_action_steps
-        for name in ("n_action_steps", "history_every"):
-            number = getattr(self, name)
-            if number is not None and number < 1:
-                raise MemobenchError(f"policy.{name} is {number}; expected a whole number from 1 on")
+        for name, least in (("n_action_steps", 1), ("history_every", 1), ("image_size", 0)):
+            if (number := getattr(self, name)) is not None and number < least:
+                raise MemobenchError(f"policy.{name} is {number}; expected a whole number from {least} on")
         for name in ("connect_timeout", "timeout"):
             if getattr(self, name) <= 0:
                 raise MemobenchError(f"policy.{name} is {getattr(self, name)}; expected seconds above 0")
-        if self.image_size is not None and self.image_size < 0:
-            raise MemobenchError(f"policy.image_size is {self.image_size}; expected pixels, or 0 as rendered")
         self.addresses()
         self.sent()
 
@@ -129,7 +126,6 @@ class RemoteConfig(UntrainedConfig):
 
     @property
     def prompt_stride(self) -> int:
-        """Steps between sent frames of the prompt."""
         kind = self.connection
         return 1 if kind.buffers else self.history_every or kind.prompt_stride or self.n_action_steps
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import msgpack
@@ -71,7 +71,6 @@ class Connection:
 
     def __init__(self, address: str, timeout: float, keys: Mapping[str, str] | None = None) -> None:
         self.address, self.timeout, self.keys = address, timeout, keys or self.keys
-        self._stack = ExitStack()
         self._connection: ClientConnection | None = None
 
     # --- an episode ---
@@ -113,7 +112,7 @@ class Connection:
         self.close()
         try:
             # No pings: openpi's servers do not answer them during inference, and the first one can take minutes.
-            connection = connect(
+            self._connection = connect(
                 self.address,
                 compression=None,
                 max_size=LARGEST_ANSWER,
@@ -122,7 +121,6 @@ class Connection:
                 close_timeout=1.0,
                 proxy=None,
             )
-            self._connection = self._stack.enter_context(connection)
             return self._greet(patience)
         except (OSError, WebSocketException) as error:
             away = not isinstance(error, InvalidHandshake) or isinstance(error, InvalidMessage)
@@ -189,8 +187,9 @@ class Connection:
 
     def close(self) -> None:
         """Disconnect."""
-        self._connection = None
-        self._stack.close()
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
 
 def reason(error: BaseException | str) -> str:
@@ -218,7 +217,6 @@ class RoboMMEConnection(Connection):
         self._frames.append(frame)
 
     def plan(self, frame: NamedValues) -> dict[str, Any]:
-        """Send all frames since the last question, and return the answer."""
         frames, self._frames = [*self._frames, frame], []
         self.ask(
             {
@@ -240,8 +238,7 @@ _OPENPIS = b"__ndarray__", b"data", b"dtype", b"shape"
 
 def pack(message: dict[str, Any]) -> bytes:
     """Pack a message as openpi-client does: arrays are maps of their bytes, type and shape."""
-    packed: bytes = msgpack.packb(message, default=_pack)
-    return packed
+    return msgpack.packb(message, default=_pack)
 
 
 def _pack(value: Any) -> Any:

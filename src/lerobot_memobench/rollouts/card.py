@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
+import json
 import os
 import platform
 import subprocess
@@ -207,12 +208,9 @@ def extended(card: Mapping[str, Any], other: Mapping[str, Any], folder: Path, *,
 
 def joined_runs(runs: Iterable[Mapping[str, Any]], again: bool = True) -> list[dict[str, Any]]:
     """Return runs without repetitions; ``times`` counts the starts of each."""
-    distinct: list[dict[str, Any]] = []
+    distinct: dict[str, dict[str, Any]] = {}
     for run in runs:
-        same = next((r for r in distinct if all(r.get(key) == run.get(key) for key in {*r, *run} - {"times"})), None)
+        same = distinct.setdefault(json.dumps(without(run, "times"), sort_keys=True), {**run, "times": 0})
         times = run.get("times", 1)
-        if same is None:
-            distinct.append({**run, "times": times})
-        else:
-            same["times"] = same["times"] + times if again else max(same["times"], times)
-    return distinct
+        same["times"] = same["times"] + times if again else max(same["times"], times)
+    return [*distinct.values()]

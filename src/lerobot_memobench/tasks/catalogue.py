@@ -403,8 +403,8 @@ def find_tasks(folder: str | Path) -> list[Path]:
     return task_folders
 
 
-def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
-    """Load a task folder; without ``require_metadata`` one without a metadata file is a task without checkpoints.
+def load_task(folder: str | Path) -> Task:
+    """Load a task folder.
 
     A memory type missing from the metadata is the parent folder's name if it is one of the four. Otherwise it is
     ``procedural`` or ``object`` for an instruction that mentions a prompt or video (``procedural`` if it also mentions
@@ -423,7 +423,7 @@ def load_task(folder: str | Path, require_metadata: bool = True) -> Task:
     with refusing(lambda why: MemobenchError(f"{bddl} cannot be read ({why}), {expected}"), bddl):
         text = bddl.read_text(encoding="utf-8-sig")
     problem = parse_bddl(text, bddl)
-    metadata = Metadata(path if require_metadata or path.exists() else None, problem)
+    metadata = Metadata(path, problem)
     data, checkpoints = metadata.data, metadata.checkpoints()
     memory_type = data.get("memory_type") or _infer_memory_type(folder, problem)
     inferred = "prompt" not in data

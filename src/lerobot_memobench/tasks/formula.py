@@ -52,71 +52,59 @@ class Atom:
 
 
 @dataclass(frozen=True)
-class And:
+class _OverOne:
+    child: Formula
+
+
+@dataclass(frozen=True)
+class _OverSeveral:
+    children: tuple[Formula, ...]
+
+
+@dataclass(frozen=True)
+class Counted:
+    """An operator with a number."""
+
+    number: int
+    child: Formula
+
+
+class And(_OverSeveral):
     """True when all children are true; every child is evaluated at every step."""
 
-    children: tuple[Formula, ...]
 
-
-@dataclass(frozen=True)
-class Or:
+class Or(_OverSeveral):
     """True when any child is true; every child is evaluated at every step."""
 
-    children: tuple[Formula, ...]
 
-
-@dataclass(frozen=True)
-class Not:
+class Not(_OverOne):
     """True when the child is not."""
 
-    child: Formula
 
-
-@dataclass(frozen=True)
-class Then:
+class Then(_OverSeveral):
     """True from the step in which the last child is done, in order, onwards; see ``Evaluator``."""
 
-    children: tuple[Formula, ...]
 
-
-@dataclass(frozen=True)
-class Never:
+class Never(_OverOne):
     """True until the child is true in any step, then permanently false."""
 
-    child: Formula
 
-
-@dataclass(frozen=True)
-class Hold:
+class Hold(Counted):
     """True when the child has been true in each of the last ``number`` steps, the present one included."""
 
-    number: int
-    child: Formula
 
-
-@dataclass(frozen=True)
-class Exactly:
+class Exactly(Counted):
     """True while the child has had exactly ``number`` rising edges (the first step counts as one)."""
 
-    number: int
-    child: Formula
 
-
-@dataclass(frozen=True)
-class When:
+class When(_OverSeveral):
     """Latch the value of the second child in the first step in which the first child is true; false before."""
 
-    children: tuple[Formula, ...]
 
-
-@dataclass(frozen=True)
-class Round:
+class Round(_OverSeveral):
     """True in the step in which the last child comes true after the earlier ones, in order; then restart."""
 
-    children: tuple[Formula, ...]
 
-
-Counted = Hold | Exactly
 Formula = Atom | And | Or | Not | Then | Never | Hold | Exactly | When | Round
 
 _OPERATORS = (And, Or, Not, Then, Never, Hold, Exactly, When, Round)
@@ -131,7 +119,7 @@ def children(formula: Formula) -> tuple[Formula, ...]:
     """Return the direct children of ``formula``; an atom has none."""
     if isinstance(formula, Atom):
         return ()
-    return (formula.child,) if isinstance(formula, Not | Never | Hold | Exactly) else formula.children
+    return formula.children if isinstance(formula, _OverSeveral) else (formula.child,)
 
 
 def walk(formula: Formula) -> Iterator[Formula]:
@@ -150,9 +138,9 @@ def rename(formula: Formula, names: Mapping[str, str]) -> Formula:
     """Return ``formula`` with entity names replaced, all at once (so ``{"a": "b", "b": "a"}`` swaps)."""
     if isinstance(formula, Atom):
         return Atom(formula.predicate, tuple(names.get(arg, arg) for arg in formula.args))
-    if isinstance(formula, Not | Never | Hold | Exactly):
-        return replace(formula, child=rename(formula.child, names))
-    return replace(formula, children=tuple(rename(child, names) for child in formula.children))
+    if isinstance(formula, _OverSeveral):
+        return replace(formula, children=tuple(rename(child, names) for child in formula.children))
+    return replace(formula, child=rename(formula.child, names))
 
 
 # --- writing ---

@@ -82,14 +82,12 @@ class MetadataFile(TypedDict):
 class Metadata:
     """Content of a metadata file; its methods raise `MemobenchError` with file and key."""
 
-    def __init__(self, path: Path | None, problem: Problem) -> None:
-        self.path, self.problem = path, problem  # None: no checkpoints; the problem declares the names
-        self.data: dict[str, Any] = {}  # a `MetadataFile`, or empty without one
-        if path is not None:
-            try:
-                self.data = read_json(path, MetadataFile, ADVICE)
-            except FileNotFoundError:
-                raise MemobenchError(f"{path} is missing; {ADVICE}") from None
+    def __init__(self, path: Path, problem: Problem) -> None:
+        self.path, self.problem = path, problem  # the problem declares the names
+        try:
+            self.data: dict[str, Any] = read_json(path, MetadataFile, ADVICE)
+        except FileNotFoundError:
+            raise MemobenchError(f"{path} is missing; {ADVICE}") from None
 
     def _error(self, key: str, found: Any, expected: str) -> MemobenchError:
         return MemobenchError(f"{self.path}: found {key} = {short(found)}, expected {expected}")
@@ -111,13 +109,9 @@ class Metadata:
             raise self._error(key, name, f"a name that the BDDL file declares, {hint}")
 
     def checkpoints(self) -> tuple[Checkpoint, ...]:
-        """Return the checkpoints; empty without a file."""
-        if not self.data:
-            return ()
+        """Return the checkpoints."""
         labels = self.data["operating_type"]
         self._check_count("operating_type", labels)
-        if "key_frame" in self.data:
-            self._check_count("key_frame", self.data["key_frame"])
         formulas = self._formulas(self.data["subtask_goals"], "subtask_goals")
         operations = [(OPERATIONS[a], OPERATIONS[b], OPERATIONS[c]) for a, b, c in labels]
         texts = self._texts(self.data["memory"], "memory")

@@ -27,7 +27,7 @@ from lerobot_memobench.commands.command_line import (
     value_of,
     without,
 )
-from lerobot_memobench.datasets.episodes import check_whole, naming_damage, read_info
+from lerobot_memobench.datasets.episodes import naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
 from lerobot_memobench.envs.settings import OBS_TYPES
@@ -110,13 +110,11 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
             from lerobot_memobench.training.loop import train
 
             train(config)
-            return 0
-        from lerobot_memobench.training.trainer import prepare, run_lerobot
+        else:
+            from lerobot_memobench.training.trainer import prepare, run_lerobot
 
-        status = run_lerobot(prepare(config, prompt_frames, obs_type, notify))
-        if status and root and (Path(root) / INFO_FILE).is_file() and config.dataset.episodes is None:
-            check_whole(Path(root))  # LeRobot's error does not name the damaged file
-        return status
+            run_lerobot(prepare(config, prompt_frames, obs_type, notify))
+    return 0
 
 
 @contextmanager

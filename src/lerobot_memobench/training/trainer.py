@@ -1,4 +1,4 @@
-"""LeRobot's own trainer, for other policies: the view of a dataset that it reads, its process, and its samples.
+"""LeRobot's own trainer, for other policies: the view of a dataset that it reads, and its samples.
 
 LeRobot trains on all frames, also on those of prompts and holds, in which actions have no effect, and uses every column
 that begins with ``observation`` as an input: images, object state, phase and step. A view is a LeRobotDataset v3.0 with
@@ -6,9 +6,8 @@ a part of the frames and columns; its videos are links to the dataset's, or mirr
 images. Each part of an episode between two holds is an episode of the view, so that chunks of actions and windows of
 inputs end at a hold.
 
-``python -m`` runs the process. LeRobot decodes all videos of a sample, and reads a table for each time of each column
-of a history. For policies without images, samples come from main memory: numbers are tensors, images are left out;
-all else of a sample is bit-identical to LeRobot's.
+LeRobot decodes all videos of a sample, and reads a table for each time of each column of a history. For policies
+without images, samples come from main memory, bit-identical to LeRobot's: numbers are tensors, images are left out.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ import json
 import logging
 import os
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +25,6 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import draccus
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -42,7 +39,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from PIL import Image, ImageOps
 from torch import Tensor
 
-from lerobot_memobench.commands.command_line import register_plugins, without
+from lerobot_memobench.commands.command_line import without
 from lerobot_memobench.constants import CAMERAS, CLOCK, IMAGE_SIZE
 from lerobot_memobench.datasets.demonstration import LEVEL_COLUMNS
 from lerobot_memobench.datasets.episodes import read_info, tables_of, undamaged
@@ -64,7 +61,6 @@ from lerobot_memobench.envs.observations import chooses_inputs, reads_prompt
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import cache_folder, explaining_disk_errors, files_below, write_file
-from lerobot_memobench.jobs.processes import lock_refusal
 from lerobot_memobench.policies.checkpoint import trained_names
 from lerobot_memobench.policies.compatibility import keeps_sizes
 from lerobot_memobench.sim.convention import CONVENTIONS, MIRRORED, OTHER, convention_of
@@ -159,32 +155,22 @@ def check_inputs(policy: Any, meta: Any, features: dict[str, Any], renamed: Mapp
         ) from None
 
 
-# -- the process -------------------------------------------------------------------------------------------------------
+# -- the trainer -------------------------------------------------------------------------------------------------------
 
 
-def run_lerobot(config: TrainPipelineConfig) -> int:
-    """Run LeRobot's trainer, with samples in memory, in a process of its own; return its exit status."""
-    command = [sys.executable, "-m", __name__]
-    if config.checkpoint_path is not None:  # LeRobot reads it in the arguments
-        command.append(f"--config_path={config.checkpoint_path / 'pretrained_model'}")
-    return subprocess.run(command, input=json.dumps(draccus.encode(config)).encode(), check=False).returncode
-
-
-def main() -> None:
-    """Run LeRobot's trainer with the configuration in the standard input, as JSON."""
+def run_lerobot(config: TrainPipelineConfig) -> None:
+    """Run LeRobot's trainer, with samples in memory."""
     from lerobot.scripts import lerobot_train
 
-    register_plugins()
-    config = draccus.decode(TrainPipelineConfig, json.load(sys.stdin))
+    line, theirs = sys.argv, lerobot_train.make_train_eval_datasets
+    # LeRobot reads the checkpoint of a resumed training in the arguments.
+    path = config.checkpoint_path
+    sys.argv = [line[0], *([] if path is None else [f"--config_path={path / 'pretrained_model'}"])]
     lerobot_train.make_train_eval_datasets = open_trainer_datasets
     try:
         lerobot_train.train(config)
-    except MemobenchError as error:
-        sys.exit(f"lerobot: {error}")
-    except OSError as error:
-        if (refusal := lock_refusal(error)) is None:
-            raise
-        sys.exit(f"lerobot: {refusal}")
+    finally:
+        sys.argv, lerobot_train.make_train_eval_datasets = line, theirs
 
 
 def open_trainer_datasets(config: TrainPipelineConfig) -> tuple[Any, Any]:
@@ -464,7 +450,3 @@ def _episodes_of(rows: pa.Table, columns: Mapping[str, str], stretches: Stretche
 def _write_table(table: pa.Table, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table, path)
-
-
-if __name__ == "__main__":
-    main()

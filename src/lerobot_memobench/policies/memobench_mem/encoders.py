@@ -230,7 +230,6 @@ class VisualTokenEncoder(nn.Module, ObservationEncoder):
 
     @property
     def key(self) -> str:
-        """Identity of the pooled tokens: weights, and size of the images."""
         return f"{self._weights}-tokens{self.tokens_per_frame}"
 
     @property

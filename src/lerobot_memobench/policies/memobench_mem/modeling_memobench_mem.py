@@ -116,8 +116,6 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         elif isinstance(self.perception, VisualTokenEncoder) and load_base:
             assert config.visual_encoder is not None
             self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
-        if config.gradient_checkpointing:
-            self.model.gradient_checkpointing_enable()
         self.to(config.device)
         self._watched = False
         self.open_loop = False  # True if observations do not follow the actions, as in replayed episodes: no stalls

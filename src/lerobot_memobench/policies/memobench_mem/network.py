@@ -94,8 +94,7 @@ class MemoryPI05(nn.Module):
 
     def __init__(self, config: MemobenchMemConfig) -> None:
         super().__init__()
-        self.config, self.gradient_checkpointing_enabled = config, False
-        dims = config.dimensions
+        self.config, dims = config, config.dimensions
         width, vlm_width = dims.expert.width, dims.vlm.width
         self.paligemma_with_expert: Any = make_backbone(config)
         self.action_in_proj = nn.Linear(config.max_action_dim, width)
@@ -195,11 +194,10 @@ class MemoryPI05(nn.Module):
             states = self._call_layer(_action_layer, layer, number, states, *both, turned, keys, bias, memory)
         states = modulated(states, next(norms))[0]
         memory.expert_states(states)
-        velocity: Tensor = self.action_out_proj(states[:, -self.config.chunk_size :].to(torch.float32))
-        return velocity
+        return self.action_out_proj(states[:, -self.config.chunk_size :].to(torch.float32))
 
     def _call_layer(self, layer: Callable[..., Any], *inputs: Any) -> Any:
-        if self.gradient_checkpointing_enabled and self.training:
+        if self.config.gradient_checkpointing and self.training:
             return checkpoint(layer, *inputs, use_reentrant=False, preserve_rng_state=False)
         return layer(*inputs)
 
@@ -226,10 +224,6 @@ class MemoryPI05(nn.Module):
         return euler_integrate(lambda x, time: self.velocity(x, next(modulations), past, memory), noise, steps)
 
     # -- parameters --------------------------------------------------------------------------------------------------
-
-    def gradient_checkpointing_enable(self) -> None:
-        self.gradient_checkpointing_enabled = True
-        self.paligemma_with_expert.paligemma.model.vision_tower.gradient_checkpointing = True
 
     def memory_parameters(self) -> dict[str, nn.Parameter]:
         """Return the parameters that plain pi0.5 does not have, by name."""
@@ -274,8 +268,7 @@ class InstructionCondition(nn.Module):
         ordered = min(words.shape[1], ORDERED_WORDS)
         scale = F.pad(1 + self.positions[:ordered].to(words.dtype), (0, 0, 0, words.shape[1] - ordered), value=1.0)
         mean = (words * scale * weights).sum(dim=1) / weights.sum(dim=1).clamp(min=1)
-        condition: Tensor = self.mlp(mean.to(next(self.mlp.parameters()).dtype))
-        return condition
+        return self.mlp(mean.to(next(self.mlp.parameters()).dtype))
 
 
 # -- layers -----------------------------------------------------------------------------------------------------------
@@ -377,8 +370,7 @@ def make_backbone(config: MemobenchMemConfig) -> PaliGemmaWithExpertModel:
     for module in (tower.multi_modal_projector, backbone.paligemma.lm_head, backbone.gemma_expert.lm_head):
         module.requires_grad_(False)
     backbone.perception = _make_encoder(config, tower)
-    typed: PaliGemmaWithExpertModel = backbone
-    return typed
+    return backbone
 
 
 def _make_encoder(config: MemobenchMemConfig, vlm: Any) -> ObservationEncoder:

@@ -186,9 +186,9 @@ class ObjectEncoder(nn.Module, ObservationEncoder):
         return [torch.cat([slots.flatten(1), hand], dim=1)], [slots[..., 0] > 0]
 
     def remember(self, batch: Mapping[str, Tensor], rows: Sequence[int]) -> Tensor:
-        """Return the stored frames (n, 1, D') of some rows; a batch without phases is execution."""
         chosen = list(rows)
         slots, state = batch[OBS_ENV_STATE][chosen].to(torch.float32), batch[OBS_RAW_STATE][chosen]
+        # A batch without phases is execution.
         phase = batch[OBS_PHASE].reshape(-1)[chosen] if OBS_PHASE in batch else torch.ones(len(chosen))
         return frame_row(slots, state.to(slots), phase.to(slots))
 
@@ -352,5 +352,4 @@ def in_order(slots: Tensor) -> Tensor:
     first = torch.where(kind == classes().index("drawer"), -position[..., 2], position[..., 0])  # drawers from the top
     # Classes are whole numbers, and a place adds less than half of one.
     order = (kind + first.clamp(-4, 4) / 10).masked_fill(field(slots, "present").squeeze(-1) == 0, torch.inf)
-    rows: Tensor = slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))
-    return rows
+    return slots.gather(1, order.argsort(dim=1)[..., None].expand(-1, -1, WIDTH))

@@ -53,6 +53,8 @@ from lerobot_memobench.tasks.memory_text import MARK, with_memory
 
 logger = logging.getLogger(__name__)
 
+Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
+
 
 def make_memobench_mem_pre_post_processors(
     config: MemobenchMemConfig,
@@ -129,12 +131,9 @@ class LookupProcessorStep(ProcessorStep):
         extra = transition.get(TransitionKey.COMPLEMENTARY_DATA) or {}
         if "index" not in extra or transition.get(TransitionKey.ACTION) is None:
             return None
-        indices: list[int] = extra["index"].reshape(-1).tolist()
-        return indices
+        return extra["index"].reshape(-1).tolist()
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+    def transform_features(self, features: Features) -> Features:
         return features
 
 
@@ -296,9 +295,7 @@ class RawStateProcessorStep(ObservationProcessorStep):
         copied = {OBS_RAW_STATE: observation[OBS_STATE].clone()} if OBS_STATE in observation else {}
         return observation | copied
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+    def transform_features(self, features: Features) -> Features:
         return features
 
 

@@ -133,7 +133,6 @@ class FrameSampling(MemoryMechanism):
         return [row for state in states for row in state]
 
     def noised(self, state: State, generator: torch.Generator) -> State:
-        """Return the frames with noise on their memory tokens."""
         seed = generator.initial_seed()
         return [[replace(frame, noise=seed + frame.step) for frame in row] for row in state]
 
@@ -151,8 +150,7 @@ class FrameSampling(MemoryMechanism):
         else:
             tokens = self.pool(frames)
             tokens = tokens if self.settings.content else torch.zeros_like(tokens)
-        encoded: Tensor = self.encoder(tokens, steps)
-        return encoded
+        return self.encoder(tokens, steps)
 
     def _tokens(self, encoded: Tensor, real: Tensor, steps: Tensor) -> MemoryTokens:
         mask, steps = (repeat(of_frames, "b f -> b (f p)", p=self.spec.tokens) for of_frames in (real, steps))

@@ -166,8 +166,7 @@ class MemoryMechanism(nn.Module, ABC):
     @classmethod
     def make_pool(cls, observations: Any, spec: MemorySpec) -> nn.Module:
         """Return the pool for the stored frames of an `encoders.ObservationEncoder`."""
-        pool: nn.Module = observations.pool()
-        return pool
+        return observations.pool()
 
     # -- a rollout ---------------------------------------------------------------------------------------------------
 

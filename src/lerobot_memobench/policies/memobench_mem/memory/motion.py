@@ -331,7 +331,6 @@ class ObjectMotion(MotionField):
         self.times = nn.Parameter(torch.randn(pairs, width) * 0.02)
 
     def between(self, before: Tensor, now: Tensor) -> Tensor:
-        """Return the displacement of the thing in each slot of the earlier frame, and of the hand."""
         return self._between(before, now)[0]
 
     def _between(self, before: Tensor, now: Tensor) -> tuple[Tensor, Tensor]:

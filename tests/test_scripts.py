@@ -1,0 +1,76 @@
+"""Scripts of `benchmarks/`, `scripts/trace.py` and the nets: they run, and notice what they look for."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts.nets.mutants import place_of, table
+from scripts.nets.store import ROOT, differences
+from tests.support.scripts import SCRIPTS
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SMALLEST = {
+    "dataset_writing": "--episodes 1 --repeats 1 --ways write",
+    "gpu": "--size tiny --device cpu --steps 1 --out {folder}/gpu.jsonl",
+    "memory_cost": "--memory none bank --steps 30 --repeats 1",
+    "mujoco_renderers": "--frames 1 --backends egl",
+    "object_update": "src --rounds 1 --memory frames",
+    "step_with_objects": "--steps 5 --repeats 1 --tasks 1",
+}
+"""Script -> arguments."""
+
+
+@pytest.mark.parametrize("name", SMALLEST)
+def test_benchmark_imports(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    for module in ("turns", "policies", "random_weights", "object_update", name):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    importlib.import_module(name)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALLEST)
+def test_benchmark_runs(name: str, tmp_path: Path) -> None:
+    arguments = SMALLEST[name].format(folder=tmp_path).split()
+    command = [sys.executable, str(BENCHMARKS / f"{name}.py"), *arguments]
+    done = subprocess.run(command, cwd=BENCHMARKS.parent, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr
+    assert "error" not in done.stdout
+    assert done.stdout
+
+
+# --- scripts/trace.py ---
+
+
+@pytest.mark.slow
+def test_trace_prints_table_and_files() -> None:
+    command = [sys.executable, str(SCRIPTS / "trace.py"), "words to plan", "--list"]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    row = re.search(r"^\| words to plan \| (\d+) \| (\d+) \|$", output, flags=re.MULTILINE)
+    files = re.findall(r"^    (\S+\.py): ", output, flags=re.MULTILINE)
+    assert 5 < len(files) == int(row[1]) <= int(row[2])
+
+
+# --- scripts/nets ---
+
+
+def test_a_comparison_names_fields_that_went_came_and_changed() -> None:
+    old = {"a": {"x": 1.0, "hash bits": "aa", "went": None}, "b": {"x": 1.0}}
+    new = {"a": {"x": 1.0 + 1e-9, "hash bits": "ab", "came": True}, "b": {"x": 2.0}}
+    assert differences(old, old, True) == []
+    heads = [line for line in differences(old, new, False) if not line.startswith(" ")]
+    assert heads == ["came: came, 1 times", "went: went, 1 times", "x: changed, 1 times"]
+    heads = [line for line in differences(old, new, True) if not line.startswith(" ")]
+    assert heads == ["came: came, 1 times", "hash bits: changed, 1 times", "went: went, 1 times", "x: changed, 2 times"]
+
+
+@pytest.mark.parametrize("name", table())
+def test_a_mutant_has_its_text_in_the_source(name: str) -> None:
+    _, _, old, new = table()[name]
+    assert place_of(old, ROOT).read_text().replace(old, new).count(old) == 0
