@@ -29,8 +29,8 @@ TASK = "turn_on_the_stove_and_turn_it_off"
 IMAGES = "observation.images."
 RENAMED = {f"{IMAGES}image": f"{IMAGES}camera1", f"{IMAGES}image2": f"{IMAGES}camera2"}
 SHORT = {"chunk_size": 4, "n_action_steps": 4}
-LENGTHS = {"observation.state": 8}
-"""Of the benchmark's vectors."""
+LENGTHS = {"observation.state": 8, "action": 7}
+"""Statistics name no images, as those of the published checkpoints."""
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_pi05(
         tokenizer_max_length=64,
         normalization_mapping={FeatureType.VISUAL.value: NormalizationMode.IDENTITY, **both},
     )
-    path = save_checkpoint(tmp_path / "pi05_libero_finetuned", config)
+    path = save_checkpoint(tmp_path / "pi05_libero_finetuned", config, LENGTHS)
     training = {"dataset": {"repo_id": "HuggingFaceVLA/libero"}, "rename_map": {}}
     (path / "train_config.json").write_text(json.dumps(training))
     check(path, datasets, tmp_path, {}, capsys)

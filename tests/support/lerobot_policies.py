@@ -46,11 +46,13 @@ def make_config(
 
 
 def save_checkpoint(folder: Path, config: PreTrainedConfig, lengths: Mapping[str, int] | None = None) -> Path:
-    """Save a checkpoint as LeRobot does; ``lengths``: of vectors in the statistics if they differ from the policy's."""
+    """Save a checkpoint as LeRobot does; ``lengths``: of vectors that alone have statistics, None for all features."""
     get_policy_class(config.type)(config).save_pretrained(folder)
+    shapes = {name: (length,) for name, length in (lengths or {}).items()}
+    for name, feature in {**config.input_features, **config.output_features}.items() if lengths is None else ():
+        shapes[name] = (3, 1, 1) if feature.type is FeatureType.VISUAL else feature.shape
     stats = {}
-    for name, feature in {**(config.input_features or {}), **(config.output_features or {})}.items():
-        shape = (3, 1, 1) if feature.type is FeatureType.VISUAL else ((lengths or {}).get(name, *feature.shape),)
+    for name, shape in shapes.items():
         stats[name] = {"mean": torch.zeros(shape), "std": torch.ones(shape)}
         stats[name] |= {"min": -torch.ones(shape), "max": torch.ones(shape)}
     for pipeline in make_pre_post_processors(config, dataset_stats=stats):
