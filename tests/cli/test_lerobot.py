@@ -306,11 +306,6 @@ def test_a_small_machine_has_few_loaders(training: Called, monkeypatch: pytest.M
     assert training.value("num_workers") == 2
 
 
-def test_the_status_of_lerobots_trainer_is_returned(training: Called) -> None:
-    training.action = lambda: 3
-    assert main(["train", "policy=act"]) == 3
-
-
 def test_settings_that_differ_from_the_checkpoints_are_noted(
     training: Called, capsys: pytest.CaptureFixture[str]
 ) -> None:

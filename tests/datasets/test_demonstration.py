@@ -80,7 +80,7 @@ def test_hash_covers_every_part(make_demo, make_task):
         ({"states": np.zeros((4, 5), dtype=np.float32)}, "states"),
         ({"actions": np.zeros((3, 7), dtype=np.float32)}, "actions"),
         ({"satisfied": np.zeros((4, 3), dtype=np.bool_)}, "satisfied"),
-        ({"satisfied": np.ones((4, 2), dtype=np.bool_), "exec_start": 1}, "in the prompt"),
+        ({"satisfied": np.ones((4, 2), dtype=np.bool_), "exec_start": 1}, "demonstration prompt"),
         ({"exec_start": 4}, "frame 4 of 4"),
         ({"images": {"image": np.zeros((4, 8, 8, 3), dtype=np.uint8)}}, "images"),
     ],

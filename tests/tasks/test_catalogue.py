@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +20,7 @@ from lerobot_memobench.tasks.catalogue import (
     task_index,
     task_names,
     task_number,
+    task_record,
 )
 from lerobot_memobench.tasks.formula import Then, atoms
 from lerobot_memobench.tasks.progress import Progress
@@ -139,6 +143,25 @@ def test_invalid_selection_names_the_entry(spec: str | list[str], suite: str, na
 
 
 # --- the reference facts next to the checkout ---
+
+
+def test_facts_equal_the_published_ones(published: Path) -> None:
+    facts = published.parent
+    known = {task["name"]: task for task in json.loads((facts / "spec" / "catalogue.json").read_text())}
+    records = [task_record(task, known[task.name]["state_dim"]) for task in tasks()]
+    check = subprocess.run(
+        [sys.executable, str(facts / "tools" / "check_catalogue.py")],
+        input=json.dumps(records),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert check.returncode == 0, check.stdout + check.stderr
+    for task in tasks():
+        fact = known[task.name]
+        assert task.family == fact["family"]
+        operations = [checkpoint["operation_by_level"] for checkpoint in fact["checkpoints"]]
+        assert ["".join(c.operations_by_level) for c in task.checkpoints] == operations
 
 
 def test_scenes_equal_the_published_ones_and_texts_do_not(published: Path) -> None:
