@@ -36,7 +36,7 @@ class Passes(PI05Pytorch):
         self.__dict__.update(vars(ours))
         own = {name: getattr(ours.config, name) for name in ("chunk_size", "max_action_dim", "num_inference_steps")}
         self.config = PI05Config(device="cpu", n_action_steps=1, **own)
-        self.rtc_processor = None
+        self.rtc_processor, self.gradient_checkpointing_enabled = None, False
         self._ours, self._memory = [ours], memory
         self.memory_pass: MemoryPass = MemoryPass()
         self.seen: Prefix | None = None
