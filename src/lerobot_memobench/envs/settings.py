@@ -70,7 +70,7 @@ HOLD, GOALS, STRICT_GOALS = "hold", "goals", 4
 """Protocol keys of strict tasks: mean control steps of a hold, and revision of the goals. Goals of revision 1 could be
 reached without memory by marks in the scene and a clock, goals of revision 2 by a camera inside a drawer and by a plan
 that passes home, goals of revision 3 by a clock, because returns without an event were held."""
-SCENE_HASHES = "scene_hash_version"  # protocol key: version of the hash of scenes (`sim.scene_hash`)
+SCENE_HASHES = "scene_hash_version"  # protocol key: version of the hash of scenes (`Simulation.scene_hash`)
 UPSTREAM_ONLY = ("suite", "referent", "oracle_memory", "pause_steps", "speed", "evidence", *MEMORY_CONTROLS)
 """Settings that keep their default in the authors' evaluation."""
 LIBERO_ONLY = (
