@@ -222,6 +222,7 @@ def test_folder_keeps_one_protocol_and_one_policy(tmp_path: Path) -> None:
     [
         ("", "JSON"),
         ('{"format": 3, "protocol": {"horizon": -3}, "policy": {}}', "horizon"),
+        ('{"format": 3, "protocol": {"suite": null}, "policy": {}}', "suite"),
         ('{"format": 2, "protocol": {}, "policy": {}}', "format"),
     ],
 )

@@ -105,3 +105,10 @@ def test_damaged_evaluations(tmp_path: Path, kind: str) -> None:
     results, refused = check(tmp_path, KINDS[kind], 30)
     assert results > 4
     assert refused > 2
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+@pytest.mark.parametrize("kind", KINDS)
+def test_many_damaged_evaluations(tmp_path: Path, kind: str) -> None:
+    check(tmp_path, KINDS[kind], 10_000)

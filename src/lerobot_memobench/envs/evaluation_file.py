@@ -49,18 +49,20 @@ UNKNOWN_POLICY = Acting()
 
 # --- its schema ---
 
-_CHECKED: dict[Any, Any] = {
-    int: Count | None,
-    float: Number | None,
-    str: Name | None,
-    bool: bool | None,
-    dict[str, str]: dict[Name, Name] | None,
-}
+_CHECKED: dict[Any, Any] = {int: Count, float: Number, str: Name, bool: bool, dict[str, str]: dict[Name, Name]}
 """Type of a setting -> type of its value in a file."""
+
+
+def _checked(hint: Any) -> Any:
+    """Return the type of a value in a file; null is allowed only where the setting may be None."""
+    kinds = typing.get_args(hint)
+    return _CHECKED[kinds[0]] | None if type(None) in kinds else _CHECKED[hint]
+
+
 _HINTS = typing.get_type_hints(EnvSettings)
 _FIELDS: dict[str, Any] = {
     **{
-        setting.name: _CHECKED[next(iter(typing.get_args(_HINTS[setting.name])), _HINTS[setting.name])]
+        setting.name: _checked(_HINTS[setting.name])
         for setting in fields(EnvSettings)
         if setting.name not in NOT_COMPARED
     },
