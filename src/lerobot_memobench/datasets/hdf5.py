@@ -212,7 +212,7 @@ def _text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     return value
 
 
-class Metadata(TypedDict):
+class EmbeddedMetadata(TypedDict):
     """Frames in ``meta_data``, -1 where unknown."""
 
     key_frame: NotRequired[list[int]]
@@ -223,7 +223,7 @@ def _metadata(text: str) -> dict[str, Any]:
     if _is_file_object(text):
         raise MemobenchError(f"meta_data holds {text[:60]!r}, the name of a Python object instead of its text")
     try:
-        return dict(checked(parsed(text), Metadata))
+        return dict(checked(parsed(text), EmbeddedMetadata))
     except Malformed as error:
         raise MemobenchError(f"meta_data is no valid JSON of a task: {error}") from None
 

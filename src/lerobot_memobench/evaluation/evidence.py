@@ -69,7 +69,7 @@ class EvidenceRates(NamedTuple):
     notes: list[str]
 
 
-class _Task(NamedTuple):
+class _TaskScenes(NamedTuple):
     """Rates of `RATES` and `RELIABLE` per scene (S, 5), the scenes that are drawn (D, S), and permuted rates (D,)."""
 
     variants: int
@@ -85,8 +85,8 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
     if not groups:
         return None
     rng = np.random.default_rng(0)  # the same log has the same intervals
-    tasks: dict[str, _Task] = {}
-    types: dict[str, list[_Task]] = {}
+    tasks: dict[str, _TaskScenes] = {}
+    types: dict[str, list[_TaskScenes]] = {}
     left_out, without_rate = 0, list[str]()
     for name, group in groups.items():
         scenes: dict[int, dict[int, Record]] = {}
@@ -100,7 +100,7 @@ def evidence_of(records: Sequence[Record]) -> EvidenceRates | None:
         values = np.array([_rates_of_scene(scene) for scene in whole])
         drawn = rng.integers(len(whole), size=(DRAWS, len(whole)))
         permuted = np.mean([_permuted(scene, rng) for scene in whole], axis=0)
-        tasks[name] = _Task(int(group[0]["variants"]), group[0].get("chance"), values, drawn, permuted)
+        tasks[name] = _TaskScenes(int(group[0]["variants"]), group[0].get("chance"), values, drawn, permuted)
         if tasks[name].chance is not None:
             types.setdefault(str(group[0]["memory_type"]), []).append(tasks[name])
     average = _rates(list(types.values())) if types else None
@@ -164,7 +164,7 @@ def _alike(name: str) -> tuple[dict[int, str], dict[int, int]]:
     return instructions, {variant.variant_index: first[variant.language, variant.goal] for variant in variants}
 
 
-def _rates(groups: Sequence[Sequence[_Task]]) -> Evidence:
+def _rates(groups: Sequence[Sequence[_TaskScenes]]) -> Evidence:
     """Return the mean over groups of the means over their tasks, with intervals over scenes."""
     tasks = [task for group in groups for task in group]
     rates = nested_mean([[task.values.mean(axis=0) for task in group] for group in groups])

@@ -228,14 +228,14 @@ class _Sample(NamedTuple):
     drawn: Array
 
 
-class _Task(NamedTuple):
+class _TaskPairs(NamedTuple):
     name: str
     memory_type: str
     family: str | None
     samples: Mapping[str, _Sample]
 
 
-def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
+def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_TaskPairs]:
     partners = {id(first): second for first, second in pairs}
     rng = np.random.default_rng(0)  # intervals do not depend on the seed of the random signs
     tasks = []
@@ -255,7 +255,7 @@ def _tasks(pairs: Sequence[Pair], by_checkpoint: bool) -> list[_Task]:
             if not np.isnan(value).any()  # does not apply
         }
         family = get_task(name).family if suite_of(name) in SUITES else None
-        tasks.append(_Task(name, str(group[0]["memory_type"]), family, samples))
+        tasks.append(_TaskPairs(name, str(group[0]["memory_type"]), family, samples))
     return tasks
 
 
@@ -268,7 +268,7 @@ def _scenes(group: Sequence[Record]) -> NDArray[np.int64]:
     return np.array(list(scenes.values()) if whole else [[k] for k in range(len(group))])
 
 
-def _scopes(tasks: Sequence[_Task]) -> list[tuple[Kind, str, list[list[_Task]]]]:
+def _scopes(tasks: Sequence[_TaskPairs]) -> list[tuple[Kind, str, list[list[_TaskPairs]]]]:
     """Return kind, name and groups of tasks of each scope, in the report's order; a rate is the mean over groups."""
     types = [[task for task in tasks if task.memory_type == name] for name in GROUPS]
     families = {task.family: [other for other in tasks if other.family == task.family] for task in tasks if task.family}

@@ -118,7 +118,7 @@ class Problem:
 
 
 @dataclass
-class _Node:
+class _Expression:
     """A word (``items`` is None) or a list; ``start`` and ``end`` delimit its source text."""
 
     path: str
@@ -126,7 +126,7 @@ class _Node:
     start: int
     end: int = -1
     word: str = ""
-    items: list[_Node] | None = None
+    items: list[_Expression] | None = None
 
     def __str__(self) -> str:
         if self.items is None:
@@ -146,13 +146,13 @@ class _Node:
             raise self.error(str(self), expected)
         return self.word
 
-    def sequence(self, expected: str) -> list[_Node]:
+    def sequence(self, expected: str) -> list[_Expression]:
         """Return the items of the list; raise for a word."""
         if self.items is None:
             raise self.error(str(self), expected)
         return self.items
 
-    def head(self, expected: str) -> tuple[str, list[_Node]]:
+    def head(self, expected: str) -> tuple[str, list[_Expression]]:
         """Split a list into its first word (lower case) and the rest."""
         items = self.sequence(expected)
         if not items:
@@ -171,15 +171,15 @@ class _Node:
         return [float(item.word) for item in items]
 
 
-def _parse(text: str, path: str) -> _Node:
+def _parse(text: str, path: str) -> _Expression:
     """Return the single top-level list."""
-    top_level: list[_Node] = []
-    root = _Node(path, line=1, start=0, items=top_level)
+    top_level: list[_Expression] = []
+    root = _Expression(path, line=1, start=0, items=top_level)
     stack, line, last = [root], 1, 0  # no recursion, which deep nesting would overflow
     for match in re.finditer(r"[()]|[^\s()]+", text):
         line += text.count("\n", last, match.start())
         last = match.start()
-        node = _Node(path, line, match.start(), match.end(), match.group())
+        node = _Expression(path, line, match.start(), match.end(), match.group())
         if node.word == ")":
             if len(stack) == 1:  # the root is no list of the file
                 raise node.error("an unmatched ')'", "'(' before it or the end of the file")
@@ -241,7 +241,7 @@ def parse_bddl(text: str, path: object = "<text>") -> Problem:
     )
 
 
-def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
+def _sections(root: _Expression) -> tuple[str, dict[str, _Expression]]:
     expected = "(define (problem NAME) ...)"
     head, rest = root.head(expected)
     if head != "define" or not rest:
@@ -249,7 +249,7 @@ def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
     head, words = rest[0].head("(problem NAME)")
     if head != "problem" or len(words) != 1:
         raise rest[0].error(str(rest[0]), "(problem NAME)")
-    sections: dict[str, _Node] = {}
+    sections: dict[str, _Expression] = {}
     for node in rest[1:]:
         key, _ = node.head("a section such as (:objects ...)")
         if key not in _SECTIONS:
@@ -262,7 +262,7 @@ def _sections(root: _Node) -> tuple[str, dict[str, _Node]]:
     return words[0].text("(problem NAME)"), sections
 
 
-def _language(text: str, section: _Node) -> str:
+def _language(text: str, section: _Expression) -> str:
     """Return the free text with white space collapsed; it may contain commas, dots and balanced parentheses."""
     language = " ".join(text[section.sequence(":language")[0].end : section.end - 1].split())
     if not language:
@@ -270,7 +270,7 @@ def _language(text: str, section: _Node) -> str:
     return language
 
 
-def _declare(names: dict[str, tuple[str, str]], node: _Node, name: str, kind: str) -> None:
+def _declare(names: dict[str, tuple[str, str]], node: _Expression, name: str, kind: str) -> None:
     """Add a name to {lower case: (kind, name)}; ``kind`` describes it in the error for a second declaration."""
     if name.lower() in names:
         first = " ".join(names[name.lower()])
@@ -278,7 +278,7 @@ def _declare(names: dict[str, tuple[str, str]], node: _Node, name: str, kind: st
     names[name.lower()] = kind, name
 
 
-def _declared(names: dict[str, tuple[str, str]], node: _Node) -> str:
+def _declared(names: dict[str, tuple[str, str]], node: _Expression) -> str:
     name = node.text("a declared name")
     if name.lower() not in names:
         known = [known for _, known in names.values()]
@@ -286,11 +286,11 @@ def _declared(names: dict[str, tuple[str, str]], node: _Node) -> str:
     return names[name.lower()][1]
 
 
-def _declarations(nodes: list[_Node], names: dict[str, tuple[str, str]]) -> dict[str, str]:
+def _declarations(nodes: list[_Expression], names: dict[str, tuple[str, str]]) -> dict[str, str]:
     """Parse ``a b - class c - class`` into {instance: class}."""
     expected = "names, '-' and a class, such as 'bowl_1 bowl_2 - akita_black_bowl'"
     declared: dict[str, str] = {}
-    waiting: list[_Node] = []
+    waiting: list[_Expression] = []
     following = iter(nodes)
     for node in following:
         if node.text(expected) != "-":
@@ -310,12 +310,12 @@ def _declarations(nodes: list[_Node], names: dict[str, tuple[str, str]]) -> dict
     return declared
 
 
-def _region(node: _Node, targets: Mapping[str, str]) -> tuple[Region, str | None]:
+def _region(node: _Expression, targets: Mapping[str, str]) -> tuple[Region, str | None]:
     items = node.sequence(_REGION)
     if not items:
         raise node.error("an empty list ()", _REGION)
     name = items[0].text(_REGION)
-    clauses: dict[str, tuple[_Node, _Node]] = {}
+    clauses: dict[str, tuple[_Expression, _Expression]] = {}
     for clause in items[1:]:
         key, values = clause.head("(:target ...), (:ranges ...) or (:yaw_rotation ...)")
         if key in clauses:
@@ -338,7 +338,7 @@ def _region(node: _Node, targets: Mapping[str, str]) -> tuple[Region, str | None
     return Region(name, targets.get(target.lower(), target), ranges, yaw), problem
 
 
-def _ranges(clause: _Node, value: _Node, name: str) -> tuple[tuple[float, float, float, float], ...]:
+def _ranges(clause: _Expression, value: _Expression, name: str) -> tuple[tuple[float, float, float, float], ...]:
     ranges = []
     for box in value.sequence("a list of (x1 y1 x2 y2)"):
         x1, y1, x2, y2 = box.numbers(4, "x1 y1 x2 y2 in metres")
@@ -350,7 +350,7 @@ def _ranges(clause: _Node, value: _Node, name: str) -> tuple[tuple[float, float,
     return tuple(ranges)
 
 
-def _yaw(clause: _Node, value: _Node, name: str) -> tuple[float, float]:
+def _yaw(clause: _Expression, value: _Expression, name: str) -> tuple[float, float]:
     pairs = value.sequence("a list of one (low high)")
     if len(pairs) != 1:
         raise clause.error(f"{len(pairs)} yaw intervals in region {name!r}", "one (low high)")
@@ -363,7 +363,7 @@ def _yaw(clause: _Node, value: _Node, name: str) -> tuple[float, float]:
 # --- goal and initial state ---
 
 
-def _formula(problem: Problem, node: _Node, depth: int = 0) -> Formula:
+def _formula(problem: Problem, node: _Expression, depth: int = 0) -> Formula:
     if depth > MAX_DEPTH:
         raise node.error(f"a formula nested deeper than {MAX_DEPTH} levels", "a flatter one")
     head, rest = node.head("a formula such as (On a b) or (And ...)")
@@ -378,7 +378,7 @@ def _formula(problem: Problem, node: _Node, depth: int = 0) -> Formula:
     return problem.resolve(make_atom(predicate, args, node.where), node.where)
 
 
-def _init(problem: Problem, section: _Node) -> tuple[Atom, ...]:
+def _init(problem: Problem, section: _Expression) -> tuple[Atom, ...]:
     """Return the initial state: atoms only, each object placed once, no cycle of supports."""
     initial: list[Atom] = []
     support: dict[str, str] = {}
