@@ -120,6 +120,10 @@ class Recorded:
         """Return stored frames of an episode, by slot."""
         return self.stored[torch.tensor(slots) + episode * self.count]
 
+    def changes(self, episode: int) -> np.ndarray:
+        """Return the slots whose stored frames differ from those before: all, because they are random."""
+        return np.arange(self.count)
+
     def text_rows(self, level: str) -> np.ndarray:
         """Return the index of each frame's text."""
         return np.arange(len(self.phase)) * len(self.texts) // self.length % len(self.texts)

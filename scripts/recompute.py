@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))  # `research` is not installed
 
 from lerobot_memobench.errors import MemobenchError, nearest  # noqa: E402
 from lerobot_memobench.evaluation.evidence import Evidence  # noqa: E402
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, mean_row, percent  # noqa: E402
+from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, mean_row, percent  # noqa: E402
 from lerobot_memobench.evaluation.records import read_runs  # noqa: E402
 from lerobot_memobench.evaluation.report import write_report  # noqa: E402
 from lerobot_memobench.tasks.catalogue import get_task  # noqa: E402
@@ -77,7 +77,7 @@ def of_tasks(tasks: Mapping[str, Row]) -> Values:
     present = {memory_type: row for memory_type, row in types.items() if row["SR"].value is not None}
     average = mean_row(present.values())
     return {
-        **{metric: in_words(average[metric]) for metric in METRICS},
+        **{metric: in_words(average[metric]) for metric in PAPER_METRICS},
         **{memory_type: f"{percent(row['SR'].value):.1f}" for memory_type, row in present.items()},
         ROLLOUTS: f"{sum(row['SR'].n for row in tasks.values()):,}",
     }
@@ -89,7 +89,7 @@ def of_evaluation(folder: Path) -> Values:
     summary, evidence = run.summary, run.evidence.average if run.evidence else None
     return {
         **(of_evidence(evidence) if evidence else {}),
-        **{metric: in_words(summary.average[metric]) for metric in METRICS},
+        **{metric: in_words(summary.average[metric]) for metric in PAPER_METRICS},
         **{name: f"{percent(row['SR'].value):.1f}" for name, row in summary.memory_types.items()},
         ROLLOUTS: f"{summary.rollouts:,}",
     }
@@ -109,7 +109,7 @@ def of_evidence(evidence: Evidence) -> Values:
 def of_card(page: Path) -> Values:
     """Return the figures of the table per task in a shipped policy's card."""
     for head, rows in tables(page):
-        if head[1:] == [ROLLOUTS, *METRICS]:
+        if head[1:] == [ROLLOUTS, *PAPER_METRICS]:
             cells = {row[0]: row[1:] for row in rows if row[0] not in (*MEMORY_TYPES, "average")}
             return of_tasks({name: _row(int(count), rates) for name, (count, *rates) in cells.items()})
     raise MemobenchError(f"{page} has no table of rollouts and metrics per task")
@@ -118,7 +118,7 @@ def of_card(page: Path) -> Values:
 def _row(rollouts: int, cells: list[str]) -> Row:
     return {
         metric: Rate(None, 0) if cell == "–" else Rate(float(cell) / 100, rollouts)
-        for metric, cell in zip(METRICS, cells, strict=True)
+        for metric, cell in zip(PAPER_METRICS, cells, strict=True)
     }
 
 
@@ -170,7 +170,7 @@ def rows_of(page: Path) -> Iterator[tuple[list[str], Values, str]]:
     A row of results is one with an interval, or of a table of SR or of memory types.
     """
     for head, rows in tables(page):
-        known = [name for name in head if name in (*METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE, SCENES)]
+        known = [name for name in head if name in (*PAPER_METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE, SCENES)]
         for row in rows:
             if {"SR", "temporal"} & set(known) or any(map(INTERVAL.search, row)):
                 cells = {name: row[head.index(name)] for name in known}

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from published import published_rows
 
+from lerobot_memobench.evaluation.metrics import PAPER_METRICS
 from lerobot_memobench.evaluation.plots import (
     GRID,
     INK,
@@ -32,7 +33,6 @@ from lerobot_memobench.evaluation.plots import (
     save,
 )
 
-METRICS = ("SR", "MSR", "MUR", "MCR")
 TYPE_LOOKS = {
     "temporal": ("#0072b2", "o"),
     "spatial": ("#d55e00", "s"),
@@ -72,8 +72,8 @@ def best_over_replan(rows: Sequence[Row]) -> dict[tuple[str, bool], list[float |
     """Return whose row -> per metric the highest average over its replan intervals (the paper's rule)."""
     found: dict[tuple[str, bool], list[float | None]] = {}
     for row in rows:
-        best = found.setdefault((row.method, row.published), [None] * len(METRICS))
-        for k, metric in enumerate(METRICS):
+        best = found.setdefault((row.method, row.published), [None] * len(PAPER_METRICS))
+        for k, metric in enumerate(PAPER_METRICS):
             values = [value for value in (best[k], row.average[metric]) if value is not None]
             best[k] = max(values, default=None)
     return found
@@ -86,15 +86,15 @@ def draw_radar(panels: Mapping[str, Sequence[Row]]) -> Figure:
         places = figure.subplots(1, len(panels), subplot_kw={"projection": "polar"}, squeeze=False)[0]
         for place, (title, rows) in zip(places, panels.items(), strict=True):
             best = best_over_replan(rows)
-            tops = [max((row[k] or 0.0 for row in best.values()), default=0.0) for k in range(len(METRICS))]
-            angles = [2 * math.pi * k / len(METRICS) for k in range(len(METRICS))]
+            tops = [max((row[k] or 0.0 for row in best.values()), default=0.0) for k in range(len(PAPER_METRICS))]
+            angles = [2 * math.pi * k / len(PAPER_METRICS) for k in range(len(PAPER_METRICS))]
             place.set_theta_offset(math.pi / 2)
             place.set_theta_direction(-1)
             place.set_ylim(0, 1)
             place.set_yticks([0.25, 0.5, 0.75, 1.0], [])
             place.grid(color=GRID, lw=0.6)
             place.spines["polar"].set_visible(False)
-            place.set_xticks(angles, [f"{metric}\n{top:.1f}" for metric, top in zip(METRICS, tops, strict=True)])
+            place.set_xticks(angles, [f"{metric}\n{top:.1f}" for metric, top in zip(PAPER_METRICS, tops, strict=True)])
             for number, ((method, published), values) in enumerate(best.items()):
                 shares = [
                     math.nan if value is None else value / top if top else 0.0
@@ -135,7 +135,7 @@ def draw_correlations(rows: Sequence[Row]) -> Figure:
     """Draw MSR, MUR and MCR against SR; evaluations are filled, the paper's rows open."""
     with paper_style():
         figure = new_figure(7.8, 3.1)
-        for place, metric in zip(figure.subplots(1, 3, sharey=True), METRICS[1:], strict=True):
+        for place, metric in zip(figure.subplots(1, 3, sharey=True), PAPER_METRICS[1:], strict=True):
             titles = []
             for published in (True, False):
                 found = points([row for row in rows if row.published is published], metric)

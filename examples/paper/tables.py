@@ -15,7 +15,7 @@ from published import RAW, PublishedRow, published_rows
 from lerobot_memobench.constants import BY_PAPER, EVALUATION_SEED, HORIZON
 from lerobot_memobench.envs.settings import IMAGE_SETTINGS
 from lerobot_memobench.evaluation.comparison import NOTE
-from lerobot_memobench.evaluation.metrics import METRICS, Rate
+from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate
 from lerobot_memobench.evaluation.records import Run, headline, read_runs
 from lerobot_memobench.evaluation.report import LEADING, PAPER_COLUMNS, run_row, wide_columns
 from lerobot_memobench.evaluation.statistics import oracle_share
@@ -53,14 +53,14 @@ def rates_table(runs: Sequence[Run], key: str, title: str, tables: Sequence[str]
     rows = (*(run_row(run) for run in runs), *map(published_cells, published))
     steps = [row.replan_steps for row in published]
     changes = {len(runs) + k for k in range(1, len(steps)) if steps[k] != steps[k - 1]}
-    wide = wide_columns(LEADING, PAPER_COLUMNS, METRICS)
+    wide = wide_columns(LEADING, PAPER_COLUMNS, PAPER_METRICS)
     return Table(key, title, rows=rows, note=NOTE, strong=range(len(runs)), rules={len(runs), *changes}, **wide)
 
 
 def published_cells(row: PublishedRow) -> tuple[Cell, ...]:
     """Return a row of the paper; it has no intervals."""
     columns = [*(row.memory_types[name] for name in MEMORY_TYPES), row.average]
-    rates = [fraction(figures[metric]) for figures in columns for metric in METRICS]
+    rates = [fraction(figures[metric]) for figures in columns for metric in PAPER_METRICS]
     return (f"paper: {row.label}", "pixels", row.replan_steps, *(Rate(rate, 0) for rate in rates))
 
 
@@ -84,10 +84,10 @@ def oracle_table() -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name in (*MEMORY_TYPES, "average"):
         found = [{**row.memory_types, "average": row.average}[name] for row in (standard, oracle)]
-        pairs = [(fraction(found[0][metric]), fraction(found[1][metric])) for metric in METRICS]
+        pairs = [(fraction(found[0][metric]), fraction(found[1][metric])) for metric in PAPER_METRICS]
         cells = [NOT_APPLICABLE if a is None else f"{percent_text(a)}/{percent_text(b)}" for a, b in pairs]
         rows.append((name, *cells, *(percent_text(oracle_share(a, b)) for a, b in pairs)))
-    header = ("memory type", *METRICS, *(f"{metric} gap closed" for metric in METRICS))
+    header = ("memory type", *PAPER_METRICS, *(f"{metric} gap closed" for metric in PAPER_METRICS))
     title = f"The paper's standard/oracle memory, replan interval {standard.replan_steps}"
     return Table("paper-oracle", title, header, rows, strong={len(rows) - 1})
 

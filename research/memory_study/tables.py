@@ -10,7 +10,7 @@ from statistics import mean
 from typing import Any
 
 from lerobot_memobench.errors import MemobenchError, count_of
-from lerobot_memobench.evaluation.metrics import METRICS, PROCESS_METRICS, Rate, Record
+from lerobot_memobench.evaluation.metrics import PAPER_METRICS, PROCESS_METRICS, Rate, Record
 from lerobot_memobench.evaluation.records import read_run, read_runs
 from lerobot_memobench.evaluation.report import evidence_values
 from lerobot_memobench.evaluation.statistics import Estimate
@@ -139,7 +139,7 @@ def _figures(folder: Path, words: Sequence[str]) -> dict[str, Any]:
 
 
 def _percentages(row: Mapping[str, Rate]) -> dict[str, Any]:
-    rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in METRICS}
+    rates = {metric: None if (value := row[metric].value) is None else 100 * value for metric in PAPER_METRICS}
     return {"n": row["SR"].n, **rates}
 
 
@@ -197,12 +197,14 @@ def _summary_line(row: str, cells: Sequence[Cell]) -> list[str]:
 
 
 def _by_memory_type(rows: Rows) -> str:
-    header = ("", *(f"{kind} {metric}" for kind in MEMORY_TYPES for metric in METRICS))
+    header = ("", *(f"{kind} {metric}" for kind in MEMORY_TYPES for metric in PAPER_METRICS))
     lines = []
     for row, cells in rows.items():
         types = [report(cell, ROLLOUTS)["memory_types"] for cell in cells]
         rates = [
-            _mean([(one.get(kind) or {}).get(metric) for one in types]) for kind in MEMORY_TYPES for metric in METRICS
+            _mean([(one.get(kind) or {}).get(metric) for one in types])
+            for kind in MEMORY_TYPES
+            for metric in PAPER_METRICS
         ]
         lines.append([row, *rates])
     return table_of(header, lines)

@@ -13,6 +13,7 @@ import sys
 from functools import partial
 from pathlib import Path
 
+from lerobot_memobench.policies.memobench_mem.memory import OURS
 from scripts.nets.access import run, shipped_policy
 from scripts.nets.store import ROOT, Facts, Parts
 
@@ -69,7 +70,6 @@ LEROBOTS --env.horizn=3 -> horizn
 """
 """Command -> wrong key or value, which the error names -> suggested name. Lines use files of earlier ones."""
 
-MEMORIES = ("frames", "bank", "motion", "keyframes", "recurrent", "fast_weights", "subgoal")
 SMALL = ("policy=memobench_mem", "policy.size=small", "policy.perception=objects", "policy.num_inference_steps=1")
 ROW = re.compile(r"^[│|]\s*([^│|\s][^│|]*?)\s*[│|]\s*([^│|]+?)\s*[│|]", re.MULTILINE)
 
@@ -79,7 +79,7 @@ def parts() -> Parts:
     lines = {line: partial(outcome, *line.split(" -> ")) for line in LINES.strip().splitlines()}
     return {
         **lines,
-        **{f"conformance {memory}": partial(conform, memory) for memory in MEMORIES},
+        **{f"conformance {memory}": partial(conform, memory) for memory in OURS},
         "recompute": recompute,
     }
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from scripts.nets.access import succeed
 from scripts.nets.store import BITS, Facts, Parts, digest
 
-MEMORIES = ("none", "frames", "bank", "motion", "keyframes", "recurrent", "fast_weights", "subgoal")
 TASKS = "4,24"
 SETTINGS = ("size=small", "seed=3", "device=cpu", "steps=12", "batch_size=6", "log_freq=1")
 
@@ -22,7 +22,9 @@ SETTINGS = ("size=small", "seed=3", "device=cpu", "steps=12", "batch_size=6", "l
 def parts() -> Parts:
     """Return one part per input and memory."""
     return {
-        f"{inputs} {memory}": partial(train, inputs, memory) for inputs in ("objects", "pixels") for memory in MEMORIES
+        f"{inputs} {memory}": partial(train, inputs, memory)
+        for inputs in ("objects", "pixels")
+        for memory in (NONE, *OURS)
     }
 
 

@@ -252,3 +252,9 @@ def test_resuming_needs_the_whole_file(tmp_path: Path) -> None:
         assert read_evaluation(tmp_path)
         with pytest.raises(MemobenchError, match="found no"):
             read_evaluation(tmp_path, whole=True)
+
+
+def test_the_page_of_the_protocol_names_each_setting() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "benchmark" / "protocol.md").read_text()
+    section = page[page.index("## Settings that must agree") : page.index("## Report at least")]
+    assert {setting.name for setting in dataclasses.fields(EnvSettings)} - {*NOT_COMPARED} <= {*section.split("`")}

@@ -17,7 +17,7 @@ from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.evaluation_file import INPUTS
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
-from lerobot_memobench.evaluation.metrics import METRICS, Rate, Row, stand_ins_of
+from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, stand_ins_of
 from lerobot_memobench.evaluation.statistics import Contrast
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
 from lerobot_memobench.untrusted import checked, parsed
@@ -99,7 +99,16 @@ PLACE = "<!-- board -->"
 TABLE = "board-table"
 """Id of the table; the page's heading has the id ``board``."""
 HEAD = (
-    *("policy", "rank", *METRICS, "follows evidence", "change by pauses", "without memory, SR", "suite", "assets"),
+    *(
+        "policy",
+        "rank",
+        *PAPER_METRICS,
+        "follows evidence",
+        "change by pauses",
+        "without memory, SR",
+        "suite",
+        "assets",
+    ),
     *("inputs", "parameters", "training data", "episodes of each task", "run by us"),
 )
 UNRANKED = 1000
@@ -127,7 +136,7 @@ def _line(rank: int | None, row: BoardRow) -> str:
     cells: list[Cell] = [
         (policy, about.model.lower()),
         (NOT_APPLICABLE, UNRANKED) if rank is None else (str(rank), rank),
-        *(_rate(row.rates[metric]) for metric in METRICS),
+        *(_rate(row.rates[metric]) for metric in PAPER_METRICS),
         _evidence(row.evidence),
         _pauses(row.pauses),
         _rate(row.without_memory),

@@ -63,7 +63,7 @@ INTACT, DELETE, SWAP, NOISE = "none", "delete", "swap", "noise"
 CORRUPTIONS = (INTACT, DELETE, SWAP, NOISE)  # values of `corrupt`: what happens to the memory of the policy
 
 IMAGE_SETTINGS = {"convention": UPRIGHT, "observation_height": IMAGE_SIZE, "observation_width": IMAGE_SIZE}
-"""Settings of images, with the values that a log omits."""
+"""Settings of images, which observations of objects alone do not have, and their defaults."""
 MEMORY_CONTROLS = ("corrupt", "corrupt_step", "reshow", "interference")  # settings of corruption and interference
 
 HOLD, GOALS, STRICT_GOALS = "hold", "goals", 4

@@ -21,6 +21,7 @@ from lerobot_memobench.evaluation.evidence import evidence_data, evidence_sectio
 from lerobot_memobench.evaluation.metrics import (
     MEMORY_TYPE,
     METRICS,
+    PAPER_METRICS,
     PROCESS_METRICS,
     SUITE,
     Rate,
@@ -512,7 +513,7 @@ def huggingface_yaml(run: Run, dataset: str) -> str:
             date=str(run.card["written"])[:10] if "written" in run.card else None,
             notes=f"{conditions}{_interval(rate)}",
         )
-        for metric in METRICS
+        for metric in PAPER_METRICS
         if (rate := run.summary.average[metric]).value is not None
     ]
     return yaml.safe_dump(eval_result_entries_to_yaml(entries), sort_keys=False, allow_unicode=True)
