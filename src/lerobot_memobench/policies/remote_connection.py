@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any, ClassVar
 
 import msgpack
@@ -72,6 +72,7 @@ class Connection:
     def __init__(self, address: str, timeout: float, keys: Mapping[str, str] | None = None) -> None:
         self.address, self.timeout, self.keys = address, timeout, keys or self.keys
         self._connection: ClientConnection | None = None
+        self._stack = ExitStack()  # websockets 17 expects a context
 
     # --- an episode ---
 
@@ -112,7 +113,7 @@ class Connection:
         self.close()
         try:
             # No pings: openpi's servers do not answer them during inference, and the first one can take minutes.
-            self._connection = connect(
+            connection = connect(
                 self.address,
                 compression=None,
                 max_size=LARGEST_ANSWER,
@@ -121,6 +122,7 @@ class Connection:
                 close_timeout=1.0,
                 proxy=None,
             )
+            self._connection = self._stack.enter_context(connection)
             return self._greet(patience)
         except (OSError, WebSocketException) as error:
             away = not isinstance(error, InvalidHandshake) or isinstance(error, InvalidMessage)
@@ -187,9 +189,8 @@ class Connection:
 
     def close(self) -> None:
         """Disconnect."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        self._stack.close()
+        self._connection = None
 
 
 def reason(error: BaseException | str) -> str:
