@@ -65,8 +65,10 @@ class MEMOBench(StepBenchmark):
         n_action_steps: actions executed per answer, open-loop.
         replan_steps: actions per plan of the server, which may answer one action and queue the rest (its
             ``chunk_size``); default ``n_action_steps``. Strict tasks need it, because holds are longer than a plan.
-        send_wrist_image, send_state, send_video_history: whether wrist camera, arm's state and demonstration prompt
-            are sent. The harness sets these and ``trained_convention`` from the hello message of a model server.
+        send_wrist_image: whether the wrist camera is sent. The harness sets this, the next two and
+            ``trained_convention`` from the hello message of a model server.
+        send_state: whether the arm's state is sent.
+        send_video_history: whether the demonstration prompt is sent.
         log_dir: folder of the episode log for ``memobench report``; None for no log.
         label: name of the model server's policy in the log.
         trained_convention: of the images that the server's policy was trained on: the ``convention``, or refused.
