@@ -206,7 +206,10 @@ def _text_attribute(group: h5py.Group, key: str, required: bool = False) -> Any:
     if isinstance(value, bytes):  # HDF5 has texts of several types
         value = value.decode("utf-8", errors="replace")
     if value is None and required:
-        raise MemobenchError(f"the attribute {key!r} is missing")
+        raise MemobenchError(
+            f"the attribute {key!r} is missing; files of LIBERO or robomimic have no checkpoints: train on them with "
+            "LeRobot's own datasets"
+        )
     if value is not None and not isinstance(value, str):
         raise MemobenchError(f"the attribute {key!r} is of type {type(group.attrs[key]).__name__}, expected text")
     return value
