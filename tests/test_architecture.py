@@ -141,7 +141,7 @@ def test_image_shows_current_imports() -> None:
 
 def test_developer_pages_name_existing_files() -> None:
     source, pages = architecture.SOURCE / PACKAGE, sorted((architecture.ROOT / "docs" / "develop").glob("*.md"))
-    assert len(pages) == 6
+    assert len(pages) == 7
     folders = [architecture.ROOT, source, *(path for path in source.rglob("*") if path.is_dir())]
     for page in pages:
         names = re.findall(r"`([\w/]+\.py)", page.read_text())

@@ -23,7 +23,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature, parser
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 
-from lerobot_memobench.constants import CLOCK, CONTROL_HZ
+from lerobot_memobench.constants import CLOCK, CONTROL_HZ, ENDED, NO_CLOCK
 from lerobot_memobench.envs.episode_log import has_log
 from lerobot_memobench.envs.evaluation_file import UNKNOWN_POLICY, Acting, check_facts, facts_of
 from lerobot_memobench.envs.observations import (
@@ -321,3 +321,19 @@ class ClockProcessorStep(ObservationProcessorStep):
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """Return the features unchanged."""
         return features
+
+
+# --- the clock of observations, read by policies ---
+
+Clock = tuple[int, int]
+"""Phase and step of an observation (`lerobot_memobench.constants`)."""
+
+
+def begins_episode(last: Clock | None, now: Clock) -> bool:
+    """Return whether an observation is the first of an episode, given the clock of the one before."""
+    return last is None or (now[1] != ENDED and (now < last or last[1] == ENDED))
+
+
+def is_frozen(last: Clock | None, now: Clock) -> bool:
+    """Return whether an observation repeats the one before, because the episode has ended."""
+    return now[1] == ENDED or (now == last and now[1] != NO_CLOCK)

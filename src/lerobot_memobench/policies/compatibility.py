@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from lerobot_memobench.constants import ENDED, NO_CLOCK
 from lerobot_memobench.datasets.episodes import read_info
 from lerobot_memobench.datasets.layout import INFO_FILE
 from lerobot_memobench.envs.settings import BOTH, OBJECTS, PIXELS
@@ -227,19 +226,3 @@ def chosen_convention(
     if requested is None and own != UPRIGHT:
         logger.warning("images have convention=%s, as in the training of %s (%s)", own, name, why)
     return requested or own
-
-
-# --- the clock of observations ---
-
-Clock = tuple[int, int]
-"""Phase and step of an observation (`lerobot_memobench.constants`)."""
-
-
-def begins_episode(last: Clock | None, now: Clock) -> bool:
-    """Return whether an observation is the first of an episode, given the clock of the one before."""
-    return last is None or (now[1] != ENDED and (now < last or last[1] == ENDED))
-
-
-def is_frozen(last: Clock | None, now: Clock) -> bool:
-    """Return whether an observation repeats the one before, because the episode has ended."""
-    return now[1] == ENDED or (now == last and now[1] != NO_CLOCK)

@@ -21,10 +21,10 @@ from PIL import Image
 from torch import Tensor
 
 from lerobot_memobench.constants import ACTION_DIM, CAMERAS, EXECUTION
+from lerobot_memobench.envs.lerobot import begins_episode, is_frozen
 from lerobot_memobench.envs.observations import PIXEL_INPUT, PRIVILEGED, SIMULATOR
 from lerobot_memobench.errors import MemobenchError, nearest, short
 from lerobot_memobench.policies.baselines import UntrainedConfig, UntrainedPolicy, make_processors
-from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
 from lerobot_memobench.policies.remote_connection import (
     DIALECTS,
     IMAGE,

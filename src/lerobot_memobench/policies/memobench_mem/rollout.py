@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lerobot_memobench.policies.compatibility import begins_episode, is_frozen
+from lerobot_memobench.envs.lerobot import begins_episode, is_frozen
 from lerobot_memobench.policies.memobench_mem.objects import HAND_DIM, rotation
 from lerobot_memobench.policies.memory_reads import Chunk
 
