@@ -231,7 +231,12 @@ def test_a_configuration_file_is_overridden_by_the_line() -> None:
         for flag in ("config_path=eval.yaml", "--config_path=eval.yaml"):
             plan = plan_line([flag, *words])
             assert {name: facts(plan)[name] for name in found} == found
-    for text, named in (("env: memobench\nsede: 1", "'sede'"), ("env: memobench\neval: 3", "eval=3")):
+    for text, named in (
+        ("env: memobench\nsede: 1", "'sede'"),
+        ("env: memobench\neval: 3", "eval=3"),
+        ("env: memobench\npolicy: {type: memobench_random, null: 3}", "'policy.None'"),
+        ("env: {type: memobench, null: 3}", "None"),
+    ):
         Path("eval.yaml").write_text(text)
         with pytest.raises(MemobenchError, match=named):
             plan_line(["config_path=eval.yaml"])

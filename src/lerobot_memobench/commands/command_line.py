@@ -23,7 +23,7 @@ import yaml
 from draccus.utils import DecodingError, ParsingError, is_choice_type, is_enum, is_literal, is_union
 
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.errors import MemobenchError, chain, nearest
+from lerobot_memobench.errors import MemobenchError, chain, cut, nearest, short
 from lerobot_memobench.policies.checkpoint import (
     TRAIN_CONFIG,
     check_checkpoint,
@@ -478,7 +478,8 @@ def given_values(kind: Any, settings: Mapping[str, Any], before: str) -> Setting
             values[name] = value_of(before + name, known[name], value)
         elif name not in (PATH, TYPE):
             keys = [f"{before}{key}" for key in known]
-            raise MemobenchError(f"there is no setting {before + name!r}, {nearest(before + name, keys)}")
+            given = f"{before}{name}"  # in a file, a name may be null or a number
+            raise MemobenchError(f"there is no setting {short(given)}, {nearest(cut(given), keys)}")
     return values
 
 

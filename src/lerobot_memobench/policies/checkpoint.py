@@ -20,7 +20,7 @@ from lerobot_memobench.constants import CLOCK
 from lerobot_memobench.envs.evaluation_file import Acting
 from lerobot_memobench.envs.observations import policy_inputs
 from lerobot_memobench.envs.settings import EnvSettings
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, short
 from lerobot_memobench.io import LONGEST_NAME, file_hash, file_name
 from lerobot_memobench.untrusted import Count, check_fetched, read_json, refusing
 
@@ -274,17 +274,21 @@ def check_processors(path: str | Path, revision: str | None = None) -> None:
 def _reasons(step: Mapping[str, Any], kind: str | None) -> Iterator[str]:
     name, config = step.get("registry_name"), step.get("config") or {}
     if not isinstance(name, str) or "class" in step:
-        yield f"names the class {step.get('class')!r}, which LeRobot would import and call"
+        yield f"names the class {short(step.get('class'))}, which LeRobot would import and call"
         return
     registered = _registered(name, kind)
     if registered is None or not _trusted(registered.__module__.partition(".")[0]):
         package = "no package" if registered is None else registered.__module__
-        yield f"names the step {name!r}, which {package} registers"
-    yield from (f"holds {key!r} in the settings of the step {name!r}, which would name code" for key in _naming(config))
+        yield f"names the step {short(name)}, which {package} registers"
+    yield from (
+        f"holds {short(key)} in the settings of the step {short(name)}, which would name code"
+        for key in _naming(config)
+    )
     if config.get("trust_remote_code") is not False:
         for setting, known in REMOTE_CODE.items():
             if config.get(setting, known) != known:
-                yield f"sets {setting}={config[setting]!r} in the step {name!r}, which runs code of that repository"
+                value = short(config[setting])
+                yield f"sets {setting}={value} in the step {short(name)}, which runs code of that repository"
 
 
 def _registered(name: str, kind: str | None) -> type | None:
