@@ -118,7 +118,7 @@ def check_names(command: str, words: Collection[str]) -> None:
         known = [*SHORT_FORMS[command], *OPTIONS[command], RECIPE, CONFIG_FILE, HELP, *names]
         for key in words:
             if "." not in key and key not in known:
-                raise MemobenchError(f"lerobot {command} has no setting {key!r}, {nearest(key, known)}")
+                raise MemobenchError(f"lerobot {command} has no setting {short(key)}, {nearest(key, known)}")
 
 
 def is_of_benchmark(words: Mapping[str, str]) -> bool:
@@ -246,7 +246,7 @@ def merged(*layers: Mapping[str, Any]) -> Settings:
     settings: Settings = {}
     for layer in layers:
         if not isinstance(layer, Mapping):
-            raise MemobenchError(f"found {layer!r} in the place of settings; expected name=value")
+            raise MemobenchError(f"found {short(layer)} in the place of settings; expected name=value")
         for key, value in layer.items():
             both = isinstance(value, Mapping) and isinstance(settings.get(key), Mapping)
             settings[key] = merged(settings[key], value) if both else value
@@ -315,15 +315,15 @@ def chosen_class(kind: Any, name: str, section: Mapping[str, Any]) -> type | Non
         chosen = checkpoint_type(path)
         if chosen not in known:
             raise MemobenchError(
-                f"the checkpoint {path} is of policy type {chosen!r}, which no installed package registers; install "
-                "the package that trained it"
+                f"the checkpoint {path} is of policy type {short(chosen)}, which no installed package registers; "
+                "install the package that trained it"
             )
     if chosen is None:
         return None
     if not isinstance(chosen, str):
         raise MemobenchError(f"found {name}.{TYPE}={str(chosen)[:80]}; expected a name")
     if chosen not in known:
-        raise MemobenchError(f"there is no {name} {chosen!r}, {nearest(chosen, known)}")
+        raise MemobenchError(f"there is no {name} {short(chosen)}, {nearest(chosen, known)}")
     return known[chosen]
 
 
@@ -462,7 +462,8 @@ def typed(kind: Any, settings: Mapping[str, Any], before: str = "") -> Settings:
         name = before.rstrip(".")
         chosen = chosen_class(kind, name, settings)
         if chosen is None:
-            raise MemobenchError(f"{before}{next(iter(settings), '')!r} needs {name}=: name one before its settings")
+            first = short(next(iter(settings), ""))
+            raise MemobenchError(f"{before}{first} needs {name}=: name one before its settings")
         beneath[TYPE] = next(key for key, value in registered(kind).items() if value is chosen)
         if (path := settings.get(PATH)) is not None:
             beneath |= {**checkpoint_settings(path), "pretrained_path": path}
@@ -497,7 +498,8 @@ def value_of(key: str, annotation: Any, value: Any) -> Any:
             name = next(iter(value))
             raise MemobenchError(f"found {key}.{name}=; {key} is one mapping: give {key}='{{\"{name}\": …}}'")
         if kind in (*PLAIN, str, Path) or is_literal(kind) or is_enum(kind):
-            raise MemobenchError(f"there is no setting {f'{key}.{next(iter(value), "")}'!r}; {key} holds one value")
+            inner_key = short(f"{key}.{next(iter(value), '')}")
+            raise MemobenchError(f"there is no setting {inner_key}; {key} holds one value")
         return value
     if is_section and value is not None:
         fields = field_types(kind) if dataclasses.is_dataclass(kind) else {TYPE: str}

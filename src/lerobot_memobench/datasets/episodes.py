@@ -349,7 +349,7 @@ def check_suite_of(folder: Path, suite: str) -> None:
         own = suite_of(name)
         if own not in (None, suite):
             raise MemobenchError(
-                f"{folder} holds demonstrations of {name!r}, a task of the {own} suite; use --suite {own}"
+                f"{folder} holds demonstrations of {short(name)}, a task of the {own} suite; use --suite {own}"
             )
 
 
@@ -394,12 +394,12 @@ def _check_record(row: dict[str, Any], record: DemonstrationRecord, texts: list[
         of_frames, of_meta = getattr(record, key), getattr(in_meta, key)
         if key != "versions" and of_frames != of_meta:
             raise MemobenchError(
-                f"meta/episodes has {key}={of_meta!r}, the frames' column {EPISODE_INFO} {of_frames!r}"
+                f"meta/episodes has {key}={short(of_meta)}, the frames' column {EPISODE_INFO} {short(of_frames)}"
             )
     again = next((frame for frame, text in enumerate(texts) if frame and text), None)
     if again is not None:
         raise MemobenchError(
-            f"{EPISODE_INFO} at frame {again} is {texts[again]!r}, expected an empty text except at frame 0"
+            f"{EPISODE_INFO} at frame {again} is {short(texts[again])}, expected an empty text except at frame 0"
         )
     if row["length"] != length:
         raise MemobenchError(f"meta/episodes has length={row['length']}, but it has {length} frames")

@@ -27,7 +27,7 @@ from annotated_types import MinLen
 from numpy.typing import NDArray
 
 from lerobot_memobench.constants import ACTION_DIM
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, short
 from lerobot_memobench.io import check_regular
 from lerobot_memobench.untrusted import Malformed, check_fetched, checked, parsed, refusing
 
@@ -73,7 +73,7 @@ class PublishedFile:
             # HDF5 would read any file of this machine that external links and arrays name.
             if name := self._file.visititems_links(_outside) or self._file.visititems(_outside):
                 raise MemobenchError(
-                    f"{name!r} is read from another file (a link, external storage or a virtual array); copy it in"
+                    f"{short(name)} is read from another file (a link, external storage or a virtual array); copy it in"
                 )
             data = self._file.get("data")
             if not isinstance(data, h5py.Group):

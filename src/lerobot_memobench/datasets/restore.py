@@ -26,7 +26,7 @@ from PIL import Image
 from lerobot_memobench.constants import CAMERAS, UPSTREAM_EVALUATIONS
 from lerobot_memobench.datasets.demonstration import Demonstration
 from lerobot_memobench.datasets.hdf5 import NO_SEED, SUFFIX, PublishedDemo, PublishedFile, first_line
-from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.errors import MemobenchError, short
 from lerobot_memobench.io import file_name
 from lerobot_memobench.sim.asset import TABLE_TOP
 from lerobot_memobench.sim.convention import UPRIGHT
@@ -104,7 +104,7 @@ def _key_frames(task: Task, demo: PublishedDemo, exec_start: int) -> list[int]:
     count, length = len(task.checkpoints), len(demo.states)
     frames: list[int] = demo.metadata.get("key_frame", [-1] * count)
     if len(frames) != count:
-        raise MemobenchError(f"meta_data has key_frame {frames!r}, expected {count} frames, -1 where unknown")
+        raise MemobenchError(f"meta_data has key_frame {short(frames)}, expected {count} frames, -1 where unknown")
     known = [frame for frame in frames if frame >= 0]
     if known != sorted(known):
         raise MemobenchError(f"key_frame {frames} is not in order: checkpoints are completed one after the other")
@@ -252,8 +252,8 @@ def _copy_bodies(source: ElementTree.Element, target: ElementTree.Element) -> No
         unread = next((key for key in BY_DEFAULTS if key in element.attrib), None)
         if unread is not None:
             raise MemobenchError(
-                f"model_file's {tag} {name[:200]!r} has the attribute {unread!r}, which is not read; store the scene "
-                "as MuJoCo saves it"
+                f"model_file's {tag} {short(name)} has the attribute {unread!r}, which is not read; store the "
+                "scene as MuJoCo saves it"
             )
         attributes = {key: element.attrib[key] for key in ("name", *KEPT[tag]) if key in element.attrib}
         copy = ElementTree.SubElement(target, tag, attributes)
@@ -274,14 +274,15 @@ def _translated(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple
     theirs, ours, task_name = joints_of(scene), joints_of(sim.model), sim.task.name
     for name, (kind, _) in ours.items():
         if name not in theirs:
-            raise MemobenchError(f"model_file has no joint {name!r}, which task {task_name} has")
+            raise MemobenchError(f"model_file has no joint {short(name)}, which task {task_name} has")
         if theirs[name][0] != kind:
-            raise MemobenchError(f"model_file's joint {name!r} is of type {theirs[name][0]!r}, expected {kind!r}")
+            raise MemobenchError(f"model_file's joint {short(name)} is of type {theirs[name][0]!r}, expected {kind!r}")
     beyond = next((name for name in theirs if name not in ours), None)
     if beyond is not None:
         body = scene.body(scene.joint(beyond).bodyid[0]).name
         raise MemobenchError(
-            f"model_file moves the body {body!r} by the joint {beyond!r}, which task {task_name} does not have"
+            f"model_file moves the body {short(body)} by the joint {short(beyond)}, which task {task_name} does not "
+            "have"
         )
     width = 1 + scene.nq + scene.nv
     if states.shape[1] != width:
@@ -302,8 +303,8 @@ def _translated(sim: Simulation, scene: mujoco.MjModel, states: States) -> tuple
         body = scene.body(_body_of(scene, name))
         if not abs(body.pos[2] - TABLE_TOP) <= NEAR_TABLE:
             raise MemobenchError(
-                f"model_file has {name!r} at {body.pos.round(3).tolist()}, not on the table at {TABLE_TOP} m: it is "
-                "the scene before its fixtures were set up; store the scene of the simulation"
+                f"model_file has {short(name)} at {body.pos.round(3).tolist()}, not on the table at {TABLE_TOP} m: it "
+                "is the scene before its fixtures were set up; store the scene of the simulation"
             )
         poses[name] = np.concatenate([body.pos, body.quat])
     return translated, poses

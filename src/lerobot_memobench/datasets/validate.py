@@ -47,7 +47,7 @@ from lerobot_memobench.datasets.layout import (
 )
 from lerobot_memobench.datasets.statistics import check_statistics, measured
 from lerobot_memobench.datasets.video import frame_reader
-from lerobot_memobench.errors import MemobenchError, cut
+from lerobot_memobench.errors import MemobenchError, cut, short
 from lerobot_memobench.experts.expert import highlights_at
 from lerobot_memobench.io import file_hash, files_below
 from lerobot_memobench.jobs.processes import process_pool
@@ -240,7 +240,8 @@ def check_manifest(folder: Path) -> None:
         facts = {"frames": episode.length} | ({} if record is None else record.model_dump(include={*COMPARED}))
         for key, value in facts.items():
             if row.get(key) != value:
-                raise MemobenchError(f"episode {episode.index} has {key}={value!r}, {MANIFEST_FILE} {row.get(key)!r}")
+                listed = short(row.get(key))
+                raise MemobenchError(f"episode {episode.index} has {key}={short(value)}, {MANIFEST_FILE} {listed}")
     if rows:
         raise MemobenchError(f"it names episode {next(iter(rows))}, which is not in the dataset")
 
