@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 # -- time
 
 CONTROL_HZ = 20
@@ -47,6 +49,13 @@ SPLITS = {
 }
 """Seeds of scenes, by purpose. The paper's seeds were used between trainings, so for policies developed here they are
 validation seeds too. The sealed ones are used once per release (`memobench test-sealed`)."""
+
+
+def split_of(seeds: Sequence[int]) -> str | None:
+    """Return the split that holds the first and the last of some seeds, None without one."""
+    return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
+
+
 GUARDED = (SEALED, PAPER, VALIDATION)
 """Splits without demonstrations, because policies are selected or evaluated on them."""
 EVALUATION_SEED, EVALUATION_EPISODES = SPLITS[PAPER].start, len(SPLITS[PAPER])

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.constants import PAPER, SPLITS
+from lerobot_memobench.constants import PAPER, split_of
 from lerobot_memobench.envs.episode_log import has_log, joined, key_of, not_run, notes_on_not_run, read_lines
 from lerobot_memobench.envs.evaluation_file import EXTENT, MOST_EPISODES, POLICY, differences, read_evaluation
 from lerobot_memobench.envs.settings import DEFAULTS, IMAGE_SETTINGS, MEMORY_CONTROLS, SCENE_HASHES
@@ -381,8 +381,8 @@ def _seeds(run: Run) -> list[str]:
         return []
     first, last = min(logged), max(logged)
     seeds = f"seeds {first} to {last}" if len(logged) > 1 else f"seed {first}"
-    name = next((name for name, split in SPLITS.items() if first in split and last in split), PAPER)
-    return [seeds if name == PAPER else f"{seeds} ({name})"]
+    name = split_of((first, last))
+    return [seeds if name in (None, PAPER) else f"{seeds} ({name})"]
 
 
 def extent_phrase(records: Sequence[Record]) -> str:

@@ -42,6 +42,7 @@ from lerobot_memobench.constants import (
     SEALED,
     SPLITS,
     VALIDATION,
+    split_of,
 )
 from lerobot_memobench.envs.evaluation_file import has_evaluation, read_evaluation
 from lerobot_memobench.envs.lerobot import MemobenchEnvConfig
@@ -123,8 +124,7 @@ class EvaluationPlan:
     @property
     def split(self) -> str | None:
         """The split of `constants.SPLITS` that holds the seeds of all its scenes, None without one."""
-        seeds = self.seeds
-        return next((name for name, split in SPLITS.items() if seeds[0] in split and seeds[-1] in split), None)
+        return split_of(self.seeds)
 
     @property
     def seeds(self) -> range:
