@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from mujoco_raster.compiled import compiled
 from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
 from mujoco_raster.errors import RasterError
-from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles
+from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles, find_points, set_planes
 from mujoco_raster.highlights import Highlight, fill_table, table_of, with_discs
-from mujoco_raster.shading import IMAGE, TRANSLUCENT, Surfaces, scratch, shade
+from mujoco_raster.shading import IMAGE, POSITION, RECORD, ROW, TRANSLUCENT, Surfaces, scratch, shade
 from mujoco_raster.textures import LAYER_SIZE, levels_of
 from mujoco_raster.view import Camera, Lights, SceneLights, camera_matrix, clipping, cropped, mirrored, model_camera
 
@@ -58,22 +58,34 @@ class Rasterizer:
         self._scene_lights = SceneLights(model)
         self._table = table_of(draw_list)
         vertices, triangles = with_discs(draw_list)
-        self._shapes = _shapes(vertices, triangles, len(self._table))
+        self._shapes, point = _shapes(vertices, triangles, len(self._table))
+        records = np.empty((len(vertices), RECORD), np.float32)
+        records[:, :3], records[:, 3:POSITION] = vertices["normal"], vertices["uv"]
+        records.view(np.int32)[:, POSITION], records.view(np.int32)[:, ROW] = point, vertices["row"]
         self._surfaces = Surfaces(
-            np.ascontiguousarray(vertices["normal"]),
-            np.ascontiguousarray(vertices["uv"]),
-            vertices["row"].astype(np.int32),
+            records,
+            records.view(np.int32),
             levels_of(draw_list.layers),
             LAYER_SIZE,
             float(averaged * LAYER_SIZE**2),
         )
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
         self._sky = draw_list.objects + np.arange(draw_list.sky, dtype=np.int32)
-        self._clip = clip_space(len(vertices), len(self._table))
+        self._clip = clip_space(self._shapes)
         self._work = scratch(len(vertices), len(triangles), width * height)
         self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
         self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
         self._upper = _upper_side(draw_list, len(triangles))
+
+    def twin(self) -> Rasterizer:
+        """Return a rasterizer of the same draw list with its own buffers, for another camera or thread."""
+        other = copy.copy(self)
+        other._scene_lights, other._table = copy.deepcopy(self._scene_lights), self._table.copy()
+        other._clip = clip_space(self._shapes)
+        other._work = scratch(len(self._surfaces.origin), len(self._shapes.triangles), self._width * self._height)
+        other._target = Target(np.zeros_like(self._target.depth), np.zeros_like(self._target.triangle))
+        other._still = OrderedDict()
+        return other
 
     # --- draw -----------------------------------------------------------------------------------------------
 
@@ -145,7 +157,7 @@ class Rasterizer:
         target.depth[:], target.triangle[:] = 0.0, -1
         view.draw_triangles(rows)
         shown = target.triangle
-        return np.where(shown >= 0, self._surfaces.row[self._shapes.triangles[shown, 0]], -1), target.depth
+        return np.where(shown >= 0, self._surfaces.origin[self._shapes.triangles[shown, 0], ROW], -1), target.depth
 
     def objects_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return ids and types (`mujoco.mjtObj`) of the rows of geoms and sites."""
@@ -331,12 +343,16 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
     return upper
 
 
-def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> Shapes:
-    """Return triangles by rows, with the bounding box of each row."""
-    row = vertices["row"].astype(np.int64)
-    first_vertex = np.searchsorted(row, np.arange(rows + 1)).astype(np.int32)
+def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> tuple[Shapes, Integers]:
+    """Return triangles by rows, with the bounding box of each row; and the position of each vertex."""
+    row = vertices["row"].astype(np.int32)
     first_triangle = np.searchsorted(row[triangles[:, 0]], np.arange(rows + 1)).astype(np.int32)
-    positions = np.ascontiguousarray(vertices["position"])
-    low, high = (f.reduceat(positions, first_vertex[:-1], axis=0) for f in (np.minimum, np.maximum))
+    points, (point, first) = np.ascontiguousarray(vertices["position"]), np.empty((2, len(row)), np.int32)
+    first = first[: find_points(points, row, point, first)]
+    points, first_point = points[first], np.searchsorted(row[first], np.arange(rows + 1)).astype(np.int32)
+    low, high = (f.reduceat(points, first_point[:-1], axis=0) for f in (np.minimum, np.maximum))
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
-    return Shapes(positions, first_vertex, triangles, first_triangle, centre, half)
+    position, corners = np.ascontiguousarray(points.T), point[triangles]
+    planes = np.empty((4, len(triangles)), np.float32)
+    set_planes(position, corners, planes)
+    return Shapes(triangles, corners, position, first_point, first_triangle, planes, centre, half), point

@@ -17,6 +17,8 @@ from mujoco_raster.geometry import Target
 from mujoco_raster.rasterizer import Rasterizer, View, mean_of_four
 from mujoco_raster.view import Camera, clipping, scene_camera
 
+LARGEST = 16384
+"""Largest height and width of an image, pixels."""
 SAMPLES = (1, 4)
 """Numbers of samples per pixel."""
 COLOUR, DEPTH, SEGMENTATION = "colour", "depth", "segmentation"
@@ -42,8 +44,8 @@ class Renderer:
     """
 
     def __init__(self, model: mujoco.MjModel, height: int = 240, width: int = 320, *, samples: int = 1) -> None:
-        if height < 1 or width < 1:
-            raise RasterError(f"an image of {height}×{width} pixels cannot be drawn; use sizes of 1 or more")
+        if not (1 <= height <= LARGEST and 1 <= width <= LARGEST):
+            raise RasterError(f"an image of {height}×{width} pixels cannot be drawn; use sizes from 1 to {LARGEST}")
         if samples not in SAMPLES:
             raise RasterError(f"samples is {samples}; expected 1 or 4")
         if missing := not_drawn(model):

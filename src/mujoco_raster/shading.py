@@ -24,11 +24,15 @@ these loops, because numba checks signed ones for negative values, which prevent
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 5
 """Attributes per vertex: light (3), texture coordinates (2)."""
+POSITION, ROW, RECORD = 5, 6, 8
+"""Columns of the integers of a vertex, and the numbers of its record."""
 IMAGE, TRANSLUCENT = 0, 1
 """Output modes: write the image, blend over the image."""
 
 # Float rows of a batch: the attributes, followed by
 _INVERSE, _LEVEL, _SHARE, _PAINT, _ACROSS, _DOWN, _FLOAT_ROWS = 5, 6, 7, 8, 11, 12, 13
+# Float rows of a batch of vertices: light (3), followed by
+_POINT, _NORMAL, _VIEW, _TO, _COLOUR, _STRENGTH, _SPECULAR, _SHININESS, _VERTEX_ROWS = 3, 6, 9, 12, 15, 18, 19, 20, 21
 # Integer rows of a batch: pixel, start of the texture, level, start of the level, side of the level, addresses of four
 # texels, the four texels.
 _WHERE, _LAYER, _BELOW, _OFFSET, _SIDE, _ADDRESS, _TEXEL, _INTEGER_ROWS = 0, 1, 2, 3, 4, 5, 9, 13
@@ -40,14 +44,14 @@ _TINY = np.float32(1e-30)
 class Surfaces(NamedTuple):
     """Vertex attributes and textures of a scene.
 
-    ``normal``: (N, 3) in the frames of the rows; ``uv``: (N, 2); ``row``: (N,); ``texels``: all levels of all layers,
-    one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two; ``detail``: its
-    area, times the pixels that are averaged to one.
+    ``vertices``: (N, 8), normals in the frames of the rows (3) and texture coordinates (2); ``origin``: the same memory
+    as integers, with the position in `Shapes` and the row in columns `POSITION` and `ROW`; ``texels``: all levels of
+    all layers, one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two;
+    ``detail``: its area, times the pixels that are averaged to one.
     """
 
-    normal: Floats
-    uv: Floats
-    row: Integers
+    vertices: Floats
+    origin: Integers
     texels: Integers
     side: int
     detail: float
@@ -56,17 +60,17 @@ class Surfaces(NamedTuple):
 class Scratch(NamedTuple):
     """Buffers for intermediate results, created by `scratch`.
 
-    ``listed_vertex`` (N,) and ``listed_triangle`` (T,): stamp of the last call that listed them. ``vertices`` and
-    ``triangles``: visible ones; ``slot``: (T,), index of a triangle in the list. ``attributes``: of the vertices;
-    ``planes``: of the listed triangles. ``runs``: first pixel, number of pixels, triangle. ``ramp``: 0, 1, 2 …
+    Visible triangles are listed, which keeps their data together in memory: ``triangles``, ``rows`` and ``planes``;
+    ``corners`` (S, 3), indices of ``vertices`` and their ``attributes``. ``slot_of_triangle`` and ``slot_of_vertex``:
+    index in these lists, valid if the list agrees. ``runs``: first pixel, number of pixels, triangle. ``ramp``: 0, 1 …
     """
 
-    stamp: NDArray[np.int64]
-    listed_vertex: NDArray[np.int64]
-    listed_triangle: NDArray[np.int64]
-    vertices: Integers
+    slot_of_triangle: Integers
+    slot_of_vertex: Integers
     triangles: Integers
-    slot: Integers
+    rows: Integers
+    corners: Integers
+    vertices: Integers
     attributes: Floats
     planes: NDArray[np.float64]
     runs: Integers
@@ -78,18 +82,19 @@ class Scratch(NamedTuple):
 def scratch(vertices: int, triangles: int, pixels: int) -> Scratch:
     """Return buffers for a scene and an image size."""
     shown = min(triangles, pixels)
+    used = min(vertices, 3 * shown)
     return Scratch(
-        np.zeros(1, np.int64),
-        np.zeros(vertices, np.int64),
-        np.zeros(triangles, np.int64),
+        np.zeros(triangles, np.int32),
         np.zeros(vertices, np.int32),
         np.zeros(shown, np.int32),
-        np.zeros(triangles, np.int32),
-        np.zeros((vertices, ATTRIBUTES), np.float32),
+        np.zeros(shown, np.int32),
+        np.zeros((shown, 3), np.int32),
+        np.zeros(used, np.int32),
+        np.zeros((used, ATTRIBUTES), np.float32),
         np.zeros((shown, ATTRIBUTES + 1, 3)),
         np.zeros((pixels, 3), np.int32),
         np.arange(BATCH, dtype=np.float32),
-        np.zeros(_FLOAT_ROWS * STRIDE, np.float32),
+        np.zeros(_VERTEX_ROWS * STRIDE, np.float32),
         np.zeros(_INTEGER_ROWS * STRIDE, np.int32),
     )
 
@@ -112,9 +117,9 @@ def shade(
     """
     height, width = target.triangle.shape
     runs = _find_runs(target.triangle, work.runs)
-    vertices, triangles = _list_shown(runs, shapes.triangles, work)
-    _light(work.vertices[:vertices], shapes.position, surfaces, table, lights, eye, work.attributes)
-    _set_up(work.triangles[:triangles], shapes.triangles, clip, width, height, work.attributes, work.planes)
+    vertices, triangles = _list_shown(runs, shapes.triangles, surfaces.origin, work)
+    _light(work.vertices[:vertices], shapes, surfaces, table, lights, eye, work.attributes, work.floats)
+    _set_up(triangles, shapes.corners, clip, width, height, work)
     t, i, texels, side = work.floats, work.integers, surfaces.texels, surfaces.side
     size = (4 * side * side - 1) // 3  # of all levels of a layer
     for textured in (False, True):
@@ -126,13 +131,12 @@ def shade(
             layer: Any = 0
             alpha: Any = _1
             if n < runs:
-                start, length = int(work.runs[n, 0]), int(work.runs[n, 1])
-                triangle = work.runs[n, 2]
-                row = surfaces.row[shapes.triangles[triangle, 0]]
+                start, length, slot = int(work.runs[n, 0]), int(work.runs[n, 1]), int(work.runs[n, 2])
+                row = work.rows[slot]
                 layer = int(table[row, 4, 3])
                 if (layer > 0) != textured:
                     continue
-                slot, alpha = int(work.slot[triangle]), min(max(table[row, 3, 3], _0), _1)
+                alpha = min(max(table[row, 3, 3], _0), _1)
             done = 0
             while done < length or (n == runs and count > 0):
                 here = min(length - done, BATCH - count)
@@ -175,43 +179,37 @@ def _find_runs(triangle: Any, runs: Any) -> Any:
 
 
 @compiled
-def _list_shown(runs: Any, corners: Any, work: Any) -> Any:
-    """List the triangles of runs and their vertices; return the numbers of vertices and triangles."""
-    work.stamp[0] += 1
-    stamp = work.stamp[0]
+def _list_shown(runs: Any, vertices_of: Any, origin: Any, work: Any) -> Any:
+    """List the triangles of runs and their vertices; return the numbers of vertices and triangles.
+
+    Args:
+        runs: number of runs; their triangles are replaced by indices in the list.
+        vertices_of: (T, 3).
+        origin: see `Surfaces`.
+        work: `Scratch`.
+    """
     vertices, triangles = 0, 0
     for n in range(runs):
         triangle = work.runs[n, 2]
-        if work.listed_triangle[triangle] == stamp:
-            continue
-        work.listed_triangle[triangle] = stamp
-        work.triangles[triangles], work.slot[triangle] = triangle, triangles
-        triangles += 1
-        for corner in range(3):
-            vertex = corners[triangle, corner]
-            if work.listed_vertex[vertex] != stamp:
-                work.listed_vertex[vertex] = stamp
-                work.vertices[vertices] = vertex
-                vertices += 1
+        slot = work.slot_of_triangle[triangle]
+        if slot >= triangles or work.triangles[slot] != triangle:
+            slot = triangles
+            triangles += 1
+            work.slot_of_triangle[triangle], work.triangles[slot] = slot, triangle
+            work.rows[slot] = origin[vertices_of[triangle, 0], ROW]
+            for corner in range(3):
+                vertex = vertices_of[triangle, corner]
+                at = work.slot_of_vertex[vertex]
+                if at >= vertices or work.vertices[at] != vertex:
+                    at = vertices
+                    vertices += 1
+                    work.slot_of_vertex[vertex], work.vertices[at] = at, vertex
+                work.corners[slot, corner] = at
+        work.runs[n, 2] = slot
     return vertices, triangles
 
 
 # --- vertices ---
-
-
-@compiled
-def _log2(value: Any) -> Any:
-    """Return the base-2 logarithm of a positive number within 1e-7, by bit-reproducible operations."""
-    bits = np.float64(value).view(np.int64)
-    exponent = (bits >> 52) - 1023
-    mantissa = np.int64((bits & 0xFFFFFFFFFFFFF) | 0x3FF0000000000000).view(np.float64)
-    if mantissa > 1.4142135623730951:
-        mantissa *= 0.5
-        exponent += 1
-    s = (mantissa - 1.0) / (mantissa + 1.0)
-    q = s * s
-    series = 1.0 + q * (1.0 / 3.0 + q * (1.0 / 5.0 + q * (1.0 / 7.0 + q * (1.0 / 9.0))))
-    return exponent + 2.8853900817779268 * s * series
 
 
 @compiled
@@ -225,87 +223,145 @@ def _rough_log2(value: Any) -> Any:
 
 @compiled
 def _power(base: Any, exponent: Any) -> Any:
-    """Return the power of a number from 0 to 1 within 1e-6, by bit-reproducible operations."""
-    if base <= 0.0:
-        return 0.0
-    product = exponent * _log2(base)
-    if product < -60.0:
-        return 0.0
+    """Return the power of a number from 0 to 1 within 1e-6, by bit-reproducible operations without branches."""
+    bits = np.float64(max(base, 1e-30)).view(np.int64)
+    exponent_of_base = np.int32(bits >> 52) - np.int32(1023)
+    mantissa = np.int64((bits & 0xFFFFFFFFFFFFF) | 0x3FF0000000000000).view(np.float64)
+    large = mantissa > 1.4142135623730951
+    mantissa = mantissa * 0.5 if large else mantissa
+    exponent_of_base = np.int32(exponent_of_base + np.int32(large))
+    s = (mantissa - 1.0) / (mantissa + 1.0)
+    q = s * s
+    series = 1.0 + q * (1.0 / 3.0 + q * (1.0 / 5.0 + q * (1.0 / 7.0 + q * (1.0 / 9.0))))
+    product = exponent * (exponent_of_base + 2.8853900817779268 * s * series)
+    small = base <= 0.0 or product < -60.0
+    product = max(product, -60.0)
     whole = math.floor(product + 0.5)
     x = (product - whole) * 0.6931471805599453
     series = 1.0 + x * (1.0 + x / 2.0 * (1.0 + x / 3.0 * (1.0 + x / 4.0 * (1.0 + x / 5.0 * (1.0 + x / 6.0)))))
-    return series * np.int64((np.int64(whole) + 1023) << 52).view(np.float64)
+    power = series * np.int64(np.int64(np.int32(whole) + np.int32(1023)) << 52).view(np.float64)
+    return 0.0 if small else power
 
 
 @compiled
-def _light(vertices: Any, position: Any, surfaces: Any, table: Any, lights: Any, eye: Any, attributes: Any) -> None:
+def _light(
+    vertices: Any, shapes: Any, surfaces: Any, table: Any, lights: Any, eye: Any, attributes: Any, t: Any
+) -> None:
     """Compute the attributes of vertices: MuJoCo's light with Blinn's specular term, clipped to 1."""
-    for i in vertices:
-        out = attributes[i]
-        row = surfaces.row[i]
-        pose, colour = table[row], table[row, 3]
-        specular, shininess, emission = table[row, 4, 0], table[row, 4, 1], table[row, 4, 2]
-        x, y, z = position[i, 0], position[i, 1], position[i, 2]
-        px = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]
-        py = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]
-        pz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        x, y, z = surfaces.normal[i, 0], surfaces.normal[i, 1], surfaces.normal[i, 2]
-        nx = pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z
-        ny = pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z
-        nz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z
-        scale = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, _TINY))
-        nx, ny, nz = nx * scale, ny * scale, nz * scale
-        vx, vy, vz = eye[0] - px, eye[1] - py, eye[2] - pz
-        scale = _1 / math.sqrt(max(vx * vx + vy * vy + vz * vz, _TINY))
-        vx, vy, vz = vx * scale, vy * scale, vz * scale
-        for c in range(3):
-            out[c] = emission * colour[c]
+    for start in range(0, vertices.size, BATCH):
+        count = min(BATCH, vertices.size - start)
+        _gather(vertices[start : start + count], shapes, surfaces, table, t)
+        _face(eye, t)
         for n in range(lights.to.shape[0]):
-            lx, ly, lz, strength = lights.to[n, 0], lights.to[n, 1], lights.to[n, 2], _1
-            if lights.placed[n]:
-                lx, ly, lz = lx - px, ly - py, lz - pz
-                distance = math.sqrt(max(lx * lx + ly * ly + lz * lz, _TINY))
-                lx, ly, lz = lx / distance, ly / distance, lz / distance
-                along = -(lx * lights.axis[n, 0] + ly * lights.axis[n, 1] + lz * lights.axis[n, 2])
-                if lights.cone[n, 0] > np.float32(-1):
-                    strength = np.float32(_power(along, lights.cone[n, 1])) if along >= lights.cone[n, 0] else _0
-                fading = lights.attenuation[n, 0] + distance * (
-                    lights.attenuation[n, 1] + distance * lights.attenuation[n, 2]
-                )
-                strength /= fading
+            _reach(lights, n, t)
+            _add_light(lights, n, t)
+        for k in range(count):
+            i, at = vertices[start + k], start + k
             for c in range(3):
-                out[c] += strength * lights.ambient[n, c] * colour[c]
-            facing = nx * lx + ny * ly + nz * lz
-            if facing <= _0 or strength <= _0:
-                continue
-            hx, hy, hz = lx + vx, ly + vy, lz + vz
-            glint = _0
-            if specular > _0:
-                towards = (nx * hx + ny * hy + nz * hz) / math.sqrt(max(hx * hx + hy * hy + hz * hz, _TINY))
-                glint = np.float32(_power(min(towards, _1), max(shininess, _0))) * specular
-            for c in range(3):
-                part = facing * lights.diffuse[n, c] * colour[c] + glint * lights.specular[n, c]
-                out[c] += strength * part
-        for c in range(3):
-            out[c] = min(out[c], _1)
-        out[3], out[4] = surfaces.uv[i, 0], surfaces.uv[i, 1]
+                attributes[at, c] = min(t[c * STRIDE + k], _1)
+            attributes[at, 3], attributes[at, 4] = surfaces.vertices[i, 3], surfaces.vertices[i, 4]
 
 
 @compiled
-def _set_up(listed: Any, corners: Any, clip: Any, width: Any, height: Any, attributes: Any, planes: Any) -> None:
+def _gather(vertices: Any, shapes: Any, surfaces: Any, table: Any, t: Any) -> None:
+    """Write positions and normals in the world, and materials, of a batch of vertices."""
+    for k in range(vertices.size):
+        i = vertices[k]
+        point, row = surfaces.origin[i, POSITION], surfaces.origin[i, ROW]
+        pose, colour = table[row], table[row, 3]
+        emission = table[row, 4, 2]
+        x, y, z = shapes.position[0, point], shapes.position[1, point], shapes.position[2, point]
+        a, b, c = surfaces.vertices[i, 0], surfaces.vertices[i, 1], surfaces.vertices[i, 2]
+        for axis in range(3):
+            m, n, o = pose[axis, 0], pose[axis, 1], pose[axis, 2]
+            t[(_POINT + axis) * STRIDE + k] = m * x + n * y + o * z + pose[axis, 3]
+            t[(_NORMAL + axis) * STRIDE + k] = m * a + n * b + o * c
+            t[axis * STRIDE + k] = emission * colour[axis]
+            t[(_COLOUR + axis) * STRIDE + k] = colour[axis]
+        t[_SPECULAR * STRIDE + k], t[_SHININESS * STRIDE + k] = table[row, 4, 0], table[row, 4, 1]
+
+
+@compiled
+def _face(eye: Any, t: Any) -> None:
+    """Normalise the normals, and compute the directions to the camera."""
+    ex, ey, ez = eye[0], eye[1], eye[2]
+    for x in range(BATCH):
+        nx, ny, nz = t[_NORMAL * STRIDE + x], t[(_NORMAL + 1) * STRIDE + x], t[(_NORMAL + 2) * STRIDE + x]
+        scale = _1 / math.sqrt(max(nx * nx + ny * ny + nz * nz, _TINY))
+        t[_NORMAL * STRIDE + x], t[(_NORMAL + 1) * STRIDE + x] = nx * scale, ny * scale
+        t[(_NORMAL + 2) * STRIDE + x] = nz * scale
+        vx, vy = ex - t[_POINT * STRIDE + x], ey - t[(_POINT + 1) * STRIDE + x]
+        vz = ez - t[(_POINT + 2) * STRIDE + x]
+        scale = _1 / math.sqrt(max(vx * vx + vy * vy + vz * vz, _TINY))
+        t[_VIEW * STRIDE + x], t[(_VIEW + 1) * STRIDE + x] = vx * scale, vy * scale
+        t[(_VIEW + 2) * STRIDE + x] = vz * scale
+
+
+@compiled
+def _reach(lights: Any, n: Any, t: Any) -> None:
+    """Compute the direction to a light and its strength at each vertex of a batch."""
+    tx, ty, tz = lights.to[n, 0], lights.to[n, 1], lights.to[n, 2]
+    if not lights.placed[n]:
+        for x in range(BATCH):
+            t[_TO * STRIDE + x], t[(_TO + 1) * STRIDE + x], t[(_TO + 2) * STRIDE + x] = tx, ty, tz
+            t[_STRENGTH * STRIDE + x] = _1
+        return
+    ax, ay, az = lights.axis[n, 0], lights.axis[n, 1], lights.axis[n, 2]
+    constant, linear, quadratic = lights.attenuation[n, 0], lights.attenuation[n, 1], lights.attenuation[n, 2]
+    cosine, falloff = lights.cone[n, 0], lights.cone[n, 1]
+    spot = cosine > np.float32(-1)
+    for x in range(BATCH):
+        lx, ly = tx - t[_POINT * STRIDE + x], ty - t[(_POINT + 1) * STRIDE + x]
+        lz = tz - t[(_POINT + 2) * STRIDE + x]
+        distance = math.sqrt(max(lx * lx + ly * ly + lz * lz, _TINY))
+        lx, ly, lz = lx / distance, ly / distance, lz / distance
+        along = -(lx * ax + ly * ay + lz * az)
+        strength = _1
+        if spot:
+            strength = np.float32(_power(along, falloff)) if along >= cosine else _0
+        strength /= constant + distance * (linear + distance * quadratic)
+        t[_TO * STRIDE + x], t[(_TO + 1) * STRIDE + x], t[(_TO + 2) * STRIDE + x] = lx, ly, lz
+        t[_STRENGTH * STRIDE + x] = strength
+
+
+@compiled
+def _add_light(lights: Any, n: Any, t: Any) -> None:
+    """Add the light of one source to a batch of vertices."""
+    a0, a1, a2 = lights.ambient[n, 0], lights.ambient[n, 1], lights.ambient[n, 2]
+    d0, d1, d2 = lights.diffuse[n, 0], lights.diffuse[n, 1], lights.diffuse[n, 2]
+    s0, s1, s2 = lights.specular[n, 0], lights.specular[n, 1], lights.specular[n, 2]
+    for x in range(BATCH):
+        lx, ly, lz = t[_TO * STRIDE + x], t[(_TO + 1) * STRIDE + x], t[(_TO + 2) * STRIDE + x]
+        nx, ny, nz = t[_NORMAL * STRIDE + x], t[(_NORMAL + 1) * STRIDE + x], t[(_NORMAL + 2) * STRIDE + x]
+        hx, hy, hz = lx + t[_VIEW * STRIDE + x], ly + t[(_VIEW + 1) * STRIDE + x], lz + t[(_VIEW + 2) * STRIDE + x]
+        strength, specular = t[_STRENGTH * STRIDE + x], t[_SPECULAR * STRIDE + x]
+        facing = nx * lx + ny * ly + nz * lz
+        towards = (nx * hx + ny * hy + nz * hz) / math.sqrt(max(hx * hx + hy * hy + hz * hz, _TINY))
+        glint = np.float32(_power(min(towards, _1), max(t[_SHININESS * STRIDE + x], _0))) * specular
+        glint = glint if specular > _0 else _0
+        lit = strength if facing > _0 and strength > _0 else _0
+        r, g, b = t[_COLOUR * STRIDE + x], t[(_COLOUR + 1) * STRIDE + x], t[(_COLOUR + 2) * STRIDE + x]
+        t[x] = t[x] + strength * a0 * r + lit * (facing * d0 * r + glint * s0)
+        t[STRIDE + x] = t[STRIDE + x] + strength * a1 * g + lit * (facing * d1 * g + glint * s1)
+        t[2 * STRIDE + x] = t[2 * STRIDE + x] + strength * a2 * b + lit * (facing * d2 * b + glint * s2)
+
+
+@compiled
+def _set_up(triangles: Any, corners: Any, clip: Any, width: Any, height: Any, work: Any) -> None:
     """Compute the plane equations of attributes divided by distance, and of the inverse distance, over the image.
 
     Args:
-        listed: (S,) triangles.
+        triangles: number of listed triangles.
         corners: (T, 3).
         clip, width, height: see `geometry.draw_triangles`.
-        attributes: attributes of the vertices.
-        planes: (S, ATTRIBUTES + 1, 3), overwritten: change per pixel to the right, per pixel down, value at the first
-            pixel.
+        work: `Scratch`. ``planes``: (S, ATTRIBUTES + 1, 3), overwritten: change per pixel to the right, change per
+            pixel down, value at the first pixel.
     """
     half_width, half_height = 0.5 * width, 0.5 * height
-    for slot in range(listed.size):
-        i, j, k = corners[listed[slot], 0], corners[listed[slot], 1], corners[listed[slot], 2]
+    planes, attributes = work.planes, work.attributes
+    for slot in range(triangles):
+        triangle = work.triangles[slot]
+        i, j, k = corners[triangle, 0], corners[triangle, 1], corners[triangle, 2]
         w0, w1, w2 = float(clip.w[i]), float(clip.w[j]), float(clip.w[k])
         x0, y0 = (clip.x[i] + w0) * half_width, (clip.y[i] + w0) * half_height
         x1, y1 = (clip.x[j] + w1) * half_width, (clip.y[j] + w1) * half_height
@@ -318,6 +374,7 @@ def _set_up(listed: Any, corners: Any, clip: Any, width: Any, height: Any, attri
         a0, b0, c0 = a0 * scale, b0 * scale, c0 * scale
         a1, b1, c1 = a1 * scale, b1 * scale, c1 * scale
         a2, b2, c2 = a2 * scale, b2 * scale, c2 * scale
+        i, j, k = work.corners[slot, 0], work.corners[slot, 1], work.corners[slot, 2]
         for n in range(ATTRIBUTES):
             p, q, r = attributes[i, n], attributes[j, n], attributes[k, n]
             planes[slot, n, 0] = a0 * p + a1 * q + a2 * r
@@ -459,7 +516,10 @@ def _paint(t: Any) -> None:
 @compiled
 def _begin_sampling(side: Any, t: Any, i: Any) -> Any:
     """Select the lower of two mipmap levels and clear the colours; return whether the upper level is needed."""
-    coarsest = np.float32(_log2(float(side))) - np.float32(0.001)
+    coarsest = _0
+    while side > 1:
+        side, coarsest = side // 2, coarsest + _1
+    coarsest -= np.float32(0.001)
     most = _0
     for x in range(BATCH):
         level = min(max(t[_LEVEL * STRIDE + x], _0), coarsest)

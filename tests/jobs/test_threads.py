@@ -153,3 +153,12 @@ def test_threads_are_set_before_libraries_load(program: str, tmp_path: Path) -> 
     words = [sys.executable, str(tmp_path / "program.py")]
     done = subprocess.run(words, env=clean, capture_output=True, text=True, check=True, timeout=300)
     assert done.stdout.splitlines()[-1] == "1 1 1"
+
+
+@pytest.mark.parametrize("second_core", [True, False])
+def test_an_error_of_one_of_several_calls(monkeypatch: pytest.MonkeyPatch, second_core: bool) -> None:
+    monkeypatch.setattr(threads, "has_second_core", lambda: second_core)
+    assert threads.at_once([lambda: 1, lambda: 2, lambda: 3]) == [1, 2, 3]
+    for calls in ([lambda: 1 // 0, lambda: 2], [lambda: 1, lambda: 1 // 0]):
+        with pytest.raises(ZeroDivisionError):
+            threads.at_once(calls)

@@ -1,4 +1,4 @@
-"""Shapes are closed, and compiled functions round every operation."""
+"""Shapes are closed, compiled functions round every operation, and no visible triangle is skipped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ import pytest
 from numba.core import caching, config
 
 from mujoco_raster.compiled import compiled
-from mujoco_raster.drawlist import build_draw_list
+from mujoco_raster.drawlist import TABLE_LINES, build_draw_list
+from mujoco_raster.geometry import Shapes, Target, clip_space, draw_triangles, find_points, set_planes
+from mujoco_raster.view import Camera, camera_matrix
 
 # --- compiled functions ---
 
@@ -68,3 +70,47 @@ def test_draw_list_has_outward_faces() -> None:
         normals = draw_list.vertices["normal"][mine[:, 0]]
         assert np.all(np.einsum("ij,ij->i", normals, np.cross(b - a, c - a)) >= -1e-9)
     np.testing.assert_allclose(np.linalg.norm(draw_list.vertices["normal"], axis=1), 1, atol=1e-5)
+
+
+# --- triangles of an image ---
+
+
+@pytest.mark.parametrize("size", [1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize(("distance", "squeezed"), [(0.3, 1.0), (2.0, 1.0), (2.0, 1e-3), (20.0, 1.0)])
+def test_no_triangle_that_is_skipped_would_show(size: float, distance: float, squeezed: float) -> None:
+    """Rounding can turn small triangles that are seen edge-on; they must not be skipped."""
+    rng = np.random.default_rng(0)
+    frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    camera = Camera(distance * frame[:, 2], frame, (2.0, 2.0), (0.0, 0.0), still=True)
+    scale = np.diag([1.0, 1.0, squeezed])
+    count = 20_000
+    centre = rng.uniform(-0.1, 0.1, (count, 3)) @ scale
+    corners = centre[:, None] + rng.normal(0.0, size, (count, 3, 3)) @ scale
+    corners[::2, 1] = centre[::2] + rng.uniform(-size, size, (count // 2, 1)) * (centre[::2] - camera.position)
+    corners[::2, 0] = centre[::2]  # the camera is in the plane of every second triangle
+    position = np.ascontiguousarray((corners @ np.linalg.inv(scale)).reshape(-1, 3).T.astype(np.float32))
+    points, planes = np.arange(3 * count, dtype=np.int32).reshape(-1, 3), np.empty((4, count), np.float32)
+    set_planes(position, points, planes)
+    ends = np.array([0, 3 * count], np.int32), np.array([0, count], np.int32)
+    shapes = Shapes(points, points, position, *ends, planes, np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    table = np.zeros((1, TABLE_LINES, 4), np.float32)
+    table[0, :3, :3] = scale
+    clip, target = clip_space(shapes), Target(np.zeros((64, 64), np.float32), np.full((64, 64), -1, np.int32))
+    matrix = camera_matrix(mujoco.MjModel.from_xml_string("<mujoco/>"), camera)
+    draw_triangles(shapes, np.zeros(1, np.int32), table, matrix, np.float32(0.01), np.float32(50.0), clip, target)
+    a, b, c = np.stack([clip.x, clip.y, clip.w], axis=1).astype(float)[points].transpose(1, 0, 2)
+    volume = np.einsum("ti,ti->t", a, np.cross(c, b))  # positive if the triangle is drawn
+    assert not (volume[~clip.front] > 0.0).any()
+    assert 0.1 < clip.front.mean() < 0.9
+
+
+def test_points_are_the_distinct_positions_of_each_row() -> None:
+    rng = np.random.default_rng(0)
+    position = rng.integers(0, 4, (5000, 3)).astype(np.float32)
+    row = np.sort(rng.integers(0, 30, 5000)).astype(np.int32)
+    point, first = np.empty(5000, np.int32), np.empty(5000, np.int32)
+    count = find_points(position, row, point, first)
+    keys = np.column_stack([row, position])
+    np.testing.assert_array_equal(keys[first[:count]][point], keys)
+    assert count == len(np.unique(keys, axis=0))
+    assert (np.diff(first[:count]) > 0).all()

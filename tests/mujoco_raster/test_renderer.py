@@ -196,8 +196,9 @@ def test_unknown_cameras_are_errors(camera: int | str, message: str) -> None:
 
 def test_misuse_is_an_error() -> None:
     model, data = scene('<geom size=".1"/>')
-    with pytest.raises(RasterError, match="0×10 pixels"):
-        Renderer(model, 0, 10)
+    for height, width in ((0, 10), (10, 16385)):
+        with pytest.raises(RasterError, match=f"{height}×{width} pixels"):
+            Renderer(model, height, width)
     with pytest.raises(RasterError, match="samples is 2; expected 1 or 4"):
         Renderer(model, samples=2)
     renderer = Renderer(model)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.jobs import threads
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from mujoco_raster.highlights import HIGHLIGHTS, Highlight
@@ -63,6 +64,17 @@ def test_threads_have_renderers_of_their_own(simulate: Simulate) -> None:
     assert len(frames) == 15
     for frame in frames:
         np.testing.assert_array_equal(frame, expected)
+
+
+@pytest.mark.parametrize("second_core", [True, False])
+def test_images_drawn_at_once_are_equal(simulate: Simulate, monkeypatch: pytest.MonkeyPatch, second_core: bool) -> None:
+    monkeypatch.setattr(threads, "has_second_core", lambda: second_core)
+    sim = simulate()
+    cameras = ["agentview", "wrist"]
+    expected = [sim.render(camera) for camera in cameras]
+    for _ in range(3):
+        np.testing.assert_array_equal(sim.render_cameras(cameras), expected)
+        np.testing.assert_array_equal(sim.render_cameras(cameras[::-1]), expected[::-1])
 
 
 def test_highlights_are_drawn_and_go_away(simulate: Simulate) -> None:
@@ -154,6 +166,7 @@ def test_non_finite_state_is_refused(place: float) -> None:
 
 _FRAME = """
 import hashlib, os, sys
+from lerobot_memobench.jobs import threads
 from lerobot_memobench.sim.simulation import RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 

@@ -333,7 +333,7 @@ class Episode:
 
     def images(self) -> dict[str, Image]:
         """Render both cameras, (height, width, 3) uint8 each, upright."""
-        return {key: self.sim.render(camera) for key, camera in CAMERAS.items()}
+        return dict(zip(CAMERAS, self.sim.render_cameras([*CAMERAS.values()]), strict=True))
 
     def subgoal(self) -> str:
         """Return the instruction for the next checkpoint; the task's instruction without checkpoints."""

@@ -7,10 +7,14 @@ matrices: they use all cores, shared among this package's processes. Variables o
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import platform
 import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 
 ACTING, LEARNING = "acting", "learning"
@@ -77,6 +81,30 @@ def limit_torch(parameters: int) -> None:
     threads = torch_threads(ACTING, sharing_processes(), large=parameters >= LARGE)
     if threads is not None and threads != torch.get_num_threads():
         torch.set_num_threads(threads)
+
+
+def at_once[Result](calls: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Return the results of calls that release the interpreter's lock, in two threads where a second core is free."""
+    if len(calls) < 2 or not has_second_core():
+        return [call() for call in calls]
+    *others, last = calls
+    running = [_second_thread(os.getpid()).submit(call) for call in others]
+    try:
+        result = last()
+    finally:
+        wait(running)
+    return [*(future.result() for future in running), result]
+
+
+@cache
+def has_second_core() -> bool:
+    """Return whether the process has two cores that it does not share with other processes of this package."""
+    return multiprocessing.parent_process() is None and sharing_processes() == 1 and cores() > 1
+
+
+@cache
+def _second_thread(process: int) -> ThreadPoolExecutor:  # a forked process has no threads of its parent
+    return ThreadPoolExecutor(1, f"second of {process}")
 
 
 def sharing_processes() -> int:

@@ -10,6 +10,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError, nearest
+from lerobot_memobench.jobs.threads import at_once
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.scene import AGENTVIEW, GLOW, GLOW_OFF, GLOW_ON, GLOW_SITES, Scene, get_scene
@@ -84,21 +86,22 @@ class _RasterizerCache(threading.local):
     """Rasterizers of a thread, by scene and size; one serves one thread at a time."""
 
     def __init__(self) -> None:
-        self.rasterizers: OrderedDict[tuple[object, ...], Rasterizer] = OrderedDict()
+        self.rasterizers: OrderedDict[tuple[object, ...], dict[str, Rasterizer]] = OrderedDict()
 
 
 _cache = _RasterizerCache()
 
 
-def get_rasterizer(scene: Scene, height: int, width: int) -> Rasterizer:
-    """Return this thread's rasterizer of a scene, created on first use and shared by simulations of the scene."""
+def get_rasterizers(scene: Scene, height: int, width: int) -> dict[str, Rasterizer]:
+    """Return this thread's rasterizers of a scene, by the cameras' names, shared by simulations of the scene."""
     from mujoco_raster.rasterizer import Rasterizer  # loads numba
 
     key, cached = (scene, height, width), _cache.rasterizers
     if key not in cached:
         while len(cached) >= CACHED_RASTERIZERS:
             cached.popitem(last=False)
-        cached[key] = Rasterizer(*scene.drawing(), width, height)
+        first = Rasterizer(*scene.drawing(), width, height)
+        cached[key] = dict(zip(MJCF_CAMERAS.values(), (first, first.twin()), strict=True))
     cached.move_to_end(key)
     return cached[key]
 
@@ -362,29 +365,35 @@ class Simulation:
 
     def render(self, camera: str = "agentview") -> Image:
         """Return the image of a camera (`agentview` or `wrist`), (height, width, 3) uint8, upright."""
+        return self.render_cameras([camera])[0]
+
+    def render_cameras(self, cameras: Sequence[str]) -> list[Image]:
+        """Return the images of several cameras, see `render`; drawn at the same time on idle cores."""
         from mujoco_raster.rasterizer import mean_of_four  # loads numba
 
+        names = [_mjcf_camera(camera) for camera in cameras]
         fine = self.render_settings.quality == HIGH
-        with self._rasterizer(2 if fine else 1) as (rasterizer, model, data):
+        with self._rasterizers(2 if fine else 1) as (rasterizers, model, data):
             for name in self._glowing:
                 lit = self.holds(Atom("turnon", (name,)))
                 model.geom(f"{name}_{GLOW}").rgba = GLOW_ON if lit else GLOW_OFF
-            image = rasterizer.draw(model, data, _mjcf_camera(camera), self.highlights)
-        return mean_of_four(image) if fine else image
+            images = at_once([partial(rasterizers[name].draw, model, data, name, self.highlights) for name in names])
+        return [mean_of_four(image) if fine else image for image in images]
 
     def visible_bodies(self, camera: str = "agentview") -> NDArray[np.int64]:
         """Return the id of the body at each pixel of a camera's image, (height, width), -1 for none."""
-        with self._rasterizer() as (rasterizer, model, data):
-            geoms = rasterizer.draw_geoms(model, data, _mjcf_camera(camera))
+        with self._rasterizers() as (rasterizers, model, data):
+            name = _mjcf_camera(camera)
+            geoms = rasterizers[name].draw_geoms(model, data, name)
         return np.where(geoms >= 0, model.geom_bodyid[geoms], -1)
 
     @contextlib.contextmanager
-    def _rasterizer(self, scale: int = 1) -> Iterator[tuple[Rasterizer, mujoco.MjModel, mujoco.MjData]]:
-        """Return a rasterizer, with the visual model and its data in the present pose."""
+    def _rasterizers(self, scale: int = 1) -> Iterator[tuple[dict[str, Rasterizer], mujoco.MjModel, mujoco.MjData]]:
+        """Return the rasterizers, with the visual model and its data in the present pose."""
         size = self.render_settings
         model, data = self._drawing()
         try:
-            yield get_rasterizer(self._scene, scale * size.height, scale * size.width), model, data
+            yield get_rasterizers(self._scene, scale * size.height, scale * size.width), model, data
         except RasterError as error:
             raise MemobenchError(str(error)) from error
 
