@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoco_raster.compiled import compiled
-from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
+from mujoco_raster.drawlist import TABLE_LINES, DrawList, Floats, Image, Mirror, Vertices
 from mujoco_raster.errors import RasterError
 from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles
-from mujoco_raster.highlights import Highlight, fill_table, table_of, with_discs
+from mujoco_raster.highlights import Highlight, fill_table
 from mujoco_raster.shading import IMAGE, TRANSLUCENT, Surfaces, scratch, shade
-from mujoco_raster.textures import LAYER_SIZE, levels_of
+from mujoco_raster.textures import LAYER_SIZE
 from mujoco_raster.view import Camera, Lights, SceneLights, camera_matrix, clipping, cropped, mirrored, model_camera
 
 MAX_COORDINATE = 1e6
@@ -56,21 +56,14 @@ class Rasterizer:
     def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, averaged: int = 1) -> None:
         self._list, self._width, self._height = draw_list, width, height
         self._scene_lights = SceneLights(model)
-        self._table = table_of(draw_list)
-        vertices, triangles = with_discs(draw_list)
+        self._table = np.zeros((len(draw_list.materials), TABLE_LINES, 4), np.float32)
+        vertices, triangles = draw_list.vertices, draw_list.triangles
         self._shapes = _shapes(vertices, triangles, len(self._table))
-        self._surfaces = Surfaces(
-            np.ascontiguousarray(vertices["normal"]),
-            np.ascontiguousarray(vertices["uv"]),
-            vertices["row"].astype(np.int32),
-            levels_of(draw_list.layers),
-            LAYER_SIZE,
-            float(averaged * LAYER_SIZE**2),
-        )
+        self._surfaces = Surfaces(*vertices[1:], draw_list.texels.ravel(), LAYER_SIZE, float(averaged * LAYER_SIZE**2))
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
         self._sky = draw_list.objects + np.arange(draw_list.sky, dtype=np.int32)
-        self._clip = clip_space(len(vertices), len(self._table))
-        self._work = scratch(len(vertices), len(triangles), width * height)
+        self._clip = clip_space(len(vertices.row), len(self._table))
+        self._work = scratch(len(vertices.row), len(triangles), width * height)
         self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
         self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
         self._upper = _upper_side(draw_list, len(triangles))
@@ -325,18 +318,17 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
     """Return a mask of the triangles of the mirror's upper side."""
     upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
     if mirror is not None:
-        mine = np.flatnonzero(np.isin(draw_list.vertices["row"][draw_list.triangles[:, 0]], mirror.rows))
-        normals = draw_list.vertices["normal"][draw_list.triangles[mine]]
+        mine = np.flatnonzero(np.isin(draw_list.vertices.row[draw_list.triangles[:, 0]], mirror.rows))
+        normals = draw_list.vertices.normal[draw_list.triangles[mine]]
         upper[mine] = (normals[:, :, 2] > 0.99).all(axis=1)
     return upper
 
 
-def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> Shapes:
+def _shapes(vertices: Vertices, triangles: NDArray[np.int32], rows: int) -> Shapes:
     """Return triangles by rows, with the bounding box of each row."""
-    row = vertices["row"].astype(np.int64)
+    position, row = vertices.position, vertices.row
     first_vertex = np.searchsorted(row, np.arange(rows + 1)).astype(np.int32)
     first_triangle = np.searchsorted(row[triangles[:, 0]], np.arange(rows + 1)).astype(np.int32)
-    positions = np.ascontiguousarray(vertices["position"])
-    low, high = (f.reduceat(positions, first_vertex[:-1], axis=0) for f in (np.minimum, np.maximum))
+    low, high = (f.reduceat(position, first_vertex[:-1], axis=0) for f in (np.minimum, np.maximum))
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
-    return Shapes(positions, first_vertex, triangles, first_triangle, centre, half)
+    return Shapes(position, first_vertex, triangles, first_triangle, centre, half)

@@ -62,9 +62,9 @@ def test_draw_list_has_outward_faces() -> None:
     faces = draw_list.triangles
     for row, geom in enumerate(draw_list.geoms):
         _, expected = list(kinds.values())[geom]
-        mine = faces[draw_list.vertices["row"][faces[:, 0]] == row]
-        a, b, c = (draw_list.vertices["position"][mine[:, k]].astype(float) for k in range(3))
+        mine = faces[draw_list.vertices.row[faces[:, 0]] == row]
+        a, b, c = (draw_list.vertices.position[mine[:, k]].astype(float) for k in range(3))
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(expected, rel=0.03)
-        normals = draw_list.vertices["normal"][mine[:, 0]]
+        normals = draw_list.vertices.normal[mine[:, 0]]
         assert np.all(np.einsum("ij,ij->i", normals, np.cross(b - a, c - a)) >= -1e-9)
-    np.testing.assert_allclose(np.linalg.norm(draw_list.vertices["normal"], axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(draw_list.vertices.normal, axis=1), 1, atol=1e-5)
