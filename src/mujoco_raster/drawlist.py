@@ -13,7 +13,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoco_raster.shapes import Triangles, box_cells, in_pieces, pieces_of, primitive, triangles_of
+from mujoco_raster.shading import POSITION, RECORD, ROW
+from mujoco_raster.shapes import (
+    Triangles,
+    box_cells,
+    disc,
+    distinct_rows,
+    in_pieces,
+    pieces_of,
+    primitive,
+    triangles_of,
+)
 from mujoco_raster.textures import cube_coordinates, flat_coordinates, layers_of, sky_box, skybox_of, texture_of
 
 DEFAULT_GROUPS = (0, 1, 2)
@@ -29,7 +39,9 @@ _DEFAULT_RGBA = np.array([0.5, 0.5, 0.5, 1.0], dtype=np.float32)
 _NO_MATERIAL = (0.5, 64.0, 0.0, 0.0)
 """MuJoCo's specular, shininess exponent and emission of a geom without material, and no texture layer."""
 
-VERTEX = np.dtype([("position", "<f4", 3), ("normal", "<f4", 3), ("uv", "<f4", 2), ("row", "<f4")])
+HIGHLIGHTS = 16
+"""Maximum number of highlights in a frame."""
+_DISC = (0.0, 1.0, 0.3, 0)  # material and layer of a highlight
 
 Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
@@ -40,28 +52,31 @@ Image = NDArray[np.uint8]
 class DrawList:
     """Triangles of a scene, sorted by rows.
 
-    A row is a geom, one side of a geom with a cube texture, or one piece of a large mesh; rows of sites and of the
-    six sides of the sky follow.
+    A row is a geom, one side of a geom with a cube texture, or one piece of a large mesh; rows of sites, of the six
+    sides of the sky and of the discs of highlights follow.
 
     Attributes:
-        vertices: structured array of `VERTEX` in the frames of their rows.
+        points: (P, 3) positions in the frames of the rows; first_point: (rows + 1,).
+        vertices: (N, 8), see `shading.Surfaces`.
         triangles: (M, 3) vertex indices, counter-clockwise from outside.
         geoms: (rows of geoms,) geom ids.
         sites: (rows of sites,) site ids.
         sky: number of rows of the sky, 6 or 0.
         still: number of static rows (no joint between them and the world), which come first.
-        layers: (L, LAYER_SIZE, LAYER_SIZE, 3) uint8 textures, the first one white.
+        texels: textures, see `textures.layers_of`.
         materials: (rows, 4) specular, shininess exponent, emission, layer.
         mirror: reflecting geom, if any.
     """
 
-    vertices: NDArray[np.void]
+    points: Floats
+    first_point: NDArray[np.int32]
+    vertices: Floats
     triangles: NDArray[np.int32]
     geoms: NDArray[np.int64]
     sites: NDArray[np.int64]
     sky: int
     still: int
-    layers: NDArray[np.uint8]
+    texels: NDArray[np.int32]
     materials: Floats
     mirror: Mirror | None = None
 
@@ -90,6 +105,7 @@ def build_draw_list(
     groups: Sequence[int] = DEFAULT_GROUPS,
     site_groups: Sequence[int] = (),
     *,
+    images: Mapping[str, Image] | None = None,
     sky: bool = False,
     coarse: bool = False,
 ) -> DrawList:
@@ -100,13 +116,14 @@ def build_draw_list(
         meshes: replacements of the scene's meshes by name.
         groups: geom groups to draw.
         site_groups: site groups to draw.
+        images: replacements of the scene's textures by name.
         sky: whether to draw the model's skybox, if it has one.
         coarse: whether to divide planes and boxes, at whose corners light is computed, only as far as LIBERO's scenes
             show it, and to draw the lower id where two geoms coincide; MuJoCo draws the higher one.
     """
     visual = np.flatnonzero(np.isin(model.geom_group, groups))
     moves = model.body_weldid[model.geom_bodyid[visual]] != 0
-    layers, layer_of = layers_of(model, sky=sky)
+    texels, layer_of = layers_of(model, images, sky=sky)
     order = 1 if coarse else -1  # the first of equally near triangles is kept
     ids = [*visual[~moves][::order].tolist(), *visual[moves][::order].tolist()]
     parts = [(geom, *part) for geom in ids for part in _textured(model, geom, meshes, layer_of, coarse)]
@@ -120,22 +137,29 @@ def build_draw_list(
     for side, layer in enumerate(skybox):
         parts.append((side, layer, sky_box(side)))
         materials.append((0.0, 0.0, 1.0, layer))  # light of its own
+    parts += [(0, 0, disc())] * HIGHLIGHTS
+    materials += [_DISC] * HIGHLIGHTS
     ends = np.cumsum([0, *(len(shape[0]) for _, _, shape in parts)]).tolist()
-    vertices = np.empty(ends[-1], dtype=VERTEX)
-    for row, (_, _, (positions, normals, uv, _)) in enumerate(parts):
-        part = vertices[ends[row] : ends[row + 1]]
-        part["position"], part["normal"], part["uv"], part["row"] = positions, normals, uv, row
-    indices = [shape[3] + start for (_, _, shape), start in zip(parts, ends, strict=False)]
+    corners, vertices = np.empty((ends[-1], 4), np.int32), np.empty((ends[-1], RECORD), np.float32)
+    for row, (_, _, shape) in enumerate(parts):
+        mine = slice(ends[row], ends[row + 1])
+        corners[mine, 0], corners.view(np.float32)[mine, 1:] = row, shape[0]
+        vertices[mine, :3], vertices[mine, 3:POSITION] = shape[1], shape[2]
+    points, point = distinct_rows(corners)
+    vertices.view(np.int32)[:, POSITION], vertices.view(np.int32)[:, ROW] = point, corners[:, 0]
+    triangles = [shape[3] + start for (_, _, shape), start in zip(parts, ends, strict=False)]
     bodies = model.geom_bodyid[rows]
     return DrawList(
+        points[:, 1:].view(np.float32),
+        np.searchsorted(points[:, 0], np.arange(len(parts) + 1)).astype(np.int32),
         vertices,
-        np.concatenate([np.zeros((0, 3), np.int32), *indices]).astype(np.int32),
+        np.concatenate(triangles, dtype=np.int32, casting="same_kind"),
         rows,
         sites,
         len(skybox),
         int((model.body_weldid[bodies] == 0).sum()),
-        layers,
-        np.array(materials, dtype=np.float32).reshape(-1, 4),
+        texels,
+        np.array(materials, dtype=np.float32),
         find_mirror(model, rows),
     )
 

@@ -71,39 +71,6 @@ def clip_space(shapes: Shapes) -> Clip:
 
 
 @compiled
-def find_points(position: Any, row: Any, point: Any, first: Any) -> Any:
-    """Find the distinct positions of each row, in the order of their first vertices; return their number.
-
-    Args:
-        position, row: (N, 3) and (N,), of the vertices.
-        point: (N,), overwritten: index of each vertex's position.
-        first: (N,), overwritten: first vertex of each position.
-    """
-    bits = position.view(np.uint32)
-    size = 1
-    while size < 2 * row.size:
-        size *= 2
-    table = np.full(size, -1, np.int32)  # open addressing
-    count = 0
-    for i in range(row.size):
-        key = np.uint64(row[i])
-        for axis in range(3):
-            key = (key ^ np.uint64(bits[i, axis])) * np.uint64(0x9E3779B97F4A7C15)
-            key ^= key >> np.uint64(32)
-        slot = key & np.uint64(size - 1)
-        while table[slot] >= 0:
-            j = first[table[slot]]
-            if row[j] == row[i] and (bits[j] == bits[i]).all():
-                break
-            slot = (slot + np.uint64(1)) & np.uint64(size - 1)
-        if table[slot] < 0:
-            table[slot], first[count] = count, i
-            count += 1
-        point[i] = table[slot]
-    return count
-
-
-@compiled
 def set_planes(position: Any, corners: Any, planes: Any) -> None:
     """Compute the planes of triangles, (4, T): normals times the triangle's smallest height, and offsets.
 

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoco_raster.compiled import compiled
-from mujoco_raster.drawlist import DrawList, Floats, Image, Mirror
+from mujoco_raster.drawlist import TABLE_LINES, DrawList, Floats, Image, Mirror
 from mujoco_raster.errors import RasterError
-from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles, find_points, set_planes
-from mujoco_raster.highlights import Highlight, fill_table, table_of, with_discs
-from mujoco_raster.shading import IMAGE, POSITION, RECORD, ROW, TRANSLUCENT, Surfaces, scratch, shade
-from mujoco_raster.textures import LAYER_SIZE, levels_of
+from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles, set_planes
+from mujoco_raster.highlights import Highlight, fill_table
+from mujoco_raster.shading import IMAGE, POSITION, ROW, TRANSLUCENT, Surfaces, scratch, shade
+from mujoco_raster.textures import LAYER_SIZE
 from mujoco_raster.view import Camera, Lights, SceneLights, camera_matrix, clipping, cropped, mirrored, model_camera
 
 MAX_COORDINATE = 1e6
@@ -56,19 +56,11 @@ class Rasterizer:
     def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, averaged: int = 1) -> None:
         self._list, self._width, self._height = draw_list, width, height
         self._scene_lights = SceneLights(model)
-        self._table = table_of(draw_list)
-        vertices, triangles = with_discs(draw_list)
-        self._shapes, point = _shapes(vertices, triangles, len(self._table))
-        records = np.empty((len(vertices), RECORD), np.float32)
-        records[:, :3], records[:, 3:POSITION] = vertices["normal"], vertices["uv"]
-        records.view(np.int32)[:, POSITION], records.view(np.int32)[:, ROW] = point, vertices["row"]
-        self._surfaces = Surfaces(
-            records,
-            records.view(np.int32),
-            levels_of(draw_list.layers),
-            LAYER_SIZE,
-            float(averaged * LAYER_SIZE**2),
-        )
+        self._table = np.zeros((len(draw_list.materials), TABLE_LINES, 4), np.float32)
+        vertices, triangles = draw_list.vertices, draw_list.triangles
+        origin, texels = vertices.view(np.int32), draw_list.texels.ravel()
+        self._shapes = _shapes(draw_list)
+        self._surfaces = Surfaces(vertices, origin, texels, LAYER_SIZE, float(averaged * LAYER_SIZE**2))
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
         self._sky = draw_list.objects + np.arange(draw_list.sky, dtype=np.int32)
         self._clip = clip_space(self._shapes)
@@ -337,22 +329,24 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
     """Return a mask of the triangles of the mirror's upper side."""
     upper, mirror = np.zeros(triangles, np.bool_), draw_list.mirror
     if mirror is not None:
-        mine = np.flatnonzero(np.isin(draw_list.vertices["row"][draw_list.triangles[:, 0]], mirror.rows))
-        normals = draw_list.vertices["normal"][draw_list.triangles[mine]]
-        upper[mine] = (normals[:, :, 2] > 0.99).all(axis=1)
+        mine = np.flatnonzero(np.isin(_row_of(draw_list), mirror.rows))
+        upper[mine] = (draw_list.vertices[draw_list.triangles[mine], 2] > 0.99).all(axis=1)
     return upper
 
 
-def _shapes(vertices: NDArray[np.void], triangles: NDArray[np.int32], rows: int) -> tuple[Shapes, Integers]:
-    """Return triangles by rows, with the bounding box of each row; and the position of each vertex."""
-    row = vertices["row"].astype(np.int32)
-    first_triangle = np.searchsorted(row[triangles[:, 0]], np.arange(rows + 1)).astype(np.int32)
-    points, (point, first) = np.ascontiguousarray(vertices["position"]), np.empty((2, len(row)), np.int32)
-    first = first[: find_points(points, row, point, first)]
-    points, first_point = points[first], np.searchsorted(row[first], np.arange(rows + 1)).astype(np.int32)
+def _row_of(draw_list: DrawList) -> Integers:
+    """Return the row of each triangle, (T,)."""
+    rows: Integers = draw_list.vertices.view(np.int32)[draw_list.triangles[:, 0], ROW]
+    return rows
+
+
+def _shapes(draw_list: DrawList) -> Shapes:
+    """Return triangles by rows, with the bounding box of each row."""
+    points, triangles, first_point = draw_list.points, draw_list.triangles, draw_list.first_point
+    first_triangle = np.searchsorted(_row_of(draw_list), np.arange(len(first_point))).astype(np.int32)
     low, high = (f.reduceat(points, first_point[:-1], axis=0) for f in (np.minimum, np.maximum))
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
-    position, corners = np.ascontiguousarray(points.T), point[triangles]
+    position, corners = np.ascontiguousarray(points.T), draw_list.vertices.view(np.int32)[triangles, POSITION]
     planes = np.empty((4, len(triangles)), np.float32)
     set_planes(position, corners, planes)
-    return Shapes(triangles, corners, position, first_point, first_triangle, planes, centre, half), point
+    return Shapes(triangles, corners, position, first_point, first_triangle, planes, centre, half)

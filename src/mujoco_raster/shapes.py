@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from mujoco_raster.compiled import compiled
 from mujoco_raster.errors import RasterError
 
 ROUND_SIDES = 32
@@ -125,7 +127,7 @@ def welded(shape: Triangles) -> Triangles:
     """Return a shape in single precision without duplicate vertices; many files list one vertex per corner."""
     points, normals, uv, triangles = shape
     rows = np.concatenate([points, normals, uv], axis=1).astype(np.float32) + np.float32(0)  # no negative zeros
-    unique, index = _unique_in_order(rows.view(np.int32))
+    unique, index = distinct_rows(rows.view(np.int32))
     rows = unique.view(np.float32)
     return rows[:, :3], rows[:, 3:6], rows[:, 6:], index[triangles].astype(np.int32)
 
@@ -191,18 +193,39 @@ def _mesh(model: mujoco.MjModel, mesh: int) -> Triangles:
         ],
         axis=1,
     )
-    unique, index = _unique_in_order(corners)
+    unique, index = distinct_rows(corners)
     coordinates = model.mesh_texcoord[uv + unique[:, 2]] if uv >= 0 else np.zeros((len(unique), 2))
     return model.mesh_vert[point + unique[:, 0]], normals[unique[:, 1]], coordinates, index.reshape(-1, 3)
 
 
-def _unique_in_order(rows: NDArray[np.integer]) -> tuple[NDArray[np.integer], NDArray[np.integer]]:
+def distinct_rows(rows: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Return the distinct rows in order of first use, and the index of each row in them."""
-    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty_like(order)
-    rank[order] = np.arange(len(order))
-    return rows[first[order]], rank[inverse.reshape(-1)]
+    index, first = np.empty((2, len(rows)), np.int32)
+    distinct = _find_distinct(rows, index, first)
+    return rows[first[:distinct]], index
+
+
+@compiled
+def _find_distinct(rows: Any, index: Any, first: Any) -> Any:
+    """Write the index of each row among the distinct ones, and the first row of each; return their number."""
+    size = 1
+    while size < 2 * rows.shape[0]:
+        size *= 2
+    table = np.full(size, -1, np.int32)  # hash table with open addressing
+    distinct = 0
+    for i in range(rows.shape[0]):
+        key = np.uint64(0)
+        for k in range(rows.shape[1]):
+            key = (key ^ np.uint64(rows[i, k])) * np.uint64(0x9E3779B97F4A7C15)
+            key ^= key >> np.uint64(32)
+        slot = key & np.uint64(size - 1)
+        while table[slot] >= 0 and (rows[first[table[slot]]] != rows[i]).any():
+            slot = (slot + np.uint64(1)) & np.uint64(size - 1)
+        if table[slot] < 0:
+            table[slot], first[distinct] = distinct, i
+            distinct += 1
+        index[i] = table[slot]
+    return distinct
 
 
 def _box(size: NDArray[np.floating]) -> Triangles:

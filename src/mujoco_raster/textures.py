@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import mujoco
@@ -15,6 +15,7 @@ from mujoco_raster.shapes import Triangles
 
 LAYER_SIZE = 512
 """Side of a texture layer, pixels; a power of two, the largest size of this package's textures."""
+LAYER_TEXELS = (4 * LAYER_SIZE**2 - 1) // 3  # pixels of a layer and of its mipmaps
 SIDES = 6
 """Sides of a cube in OpenGL's order: +x, −x, +y, −y, +z, −z."""
 
@@ -23,21 +24,37 @@ _DOWN = ((1, -1), (1, -1), (2, 1), (2, -1), (1, -1), (1, -1))
 """Axis and direction of the image on each side of a cube (OpenGL 2.1, table 3.21)."""
 
 
-def layers_of(model: mujoco.MjModel, *, sky: bool = False) -> tuple[NDArray[np.uint8], dict[int, tuple[int, ...]]]:
-    """Return a model's textures at one size, and texture id → its layer (six for a cube); layer 0 is white."""
+def layers_of(
+    model: mujoco.MjModel, images: Mapping[str, NDArray[np.uint8]] | None = None, *, sky: bool = False
+) -> tuple[NDArray[np.int32], dict[int, tuple[int, ...]]]:
+    """Return the mipmaps of a model's textures at one size, and texture id → its layer (six for a cube).
+
+    Args:
+        model: compiled scene.
+        images: replacements of the scene's textures by name, (height, width, 3).
+        sky: whether to include the skybox.
+
+    Returns:
+        Layers from full size to one pixel, (L, `LAYER_TEXELS`), pixels as red + 256 green + 65536 blue; layer 0 is
+        white.
+    """
     layers: list[NDArray[np.uint8]] = [np.full((LAYER_SIZE, LAYER_SIZE, 3), 255, dtype=np.uint8)]
     layer_of: dict[int, tuple[int, ...]] = {}
     known: dict[bytes, int] = {}  # the sides of a cube often share an image
     for texture in range(model.ntex):
         if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX and not (sky and texture == skybox_of(model)):
             continue
-        for image in _images(model, texture, pixels_of(model, texture)):
-            content = image.tobytes()
-            if content not in known:
+        pixels = (images or {}).get(model.tex(texture).name)
+        sides = _images(model, texture, pixels_of(model, texture) if pixels is None else pixels)
+        for image in sides:
+            if (content := image.tobytes()) not in known:
                 known[content] = len(layers)
                 layers.append(resized(image))
             layer_of[texture] = (*layer_of.get(texture, ()), known[content])
-    return np.stack(layers), layer_of
+    texels = np.empty((len(layers), LAYER_TEXELS), np.int32)
+    for layer, levels in zip(layers, texels, strict=True):
+        _fill_levels(np.array(layer, order="C"), levels)
+    return texels, layer_of
 
 
 def skybox_of(model: mujoco.MjModel) -> int:
@@ -73,10 +90,10 @@ def pixels_of(model: mujoco.MjModel, texture: int) -> NDArray[np.uint8]:
 
 def resized(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an image resized to the layer size."""
-    from PIL import Image
-
     if image.shape[:2] == (LAYER_SIZE, LAYER_SIZE):
         return image
+    from PIL import Image
+
     return np.asarray(Image.fromarray(image).resize((LAYER_SIZE, LAYER_SIZE), Image.Resampling.BICUBIC))
 
 
@@ -87,43 +104,25 @@ def _images(model: mujoco.MjModel, texture: int, pixels: NDArray[np.uint8]) -> l
     return [pixels] * SIDES if len(pixels) == pixels.shape[1] else np.split(pixels, SIDES)
 
 
-def levels_of(layers: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return the mipmaps of all layers, from full size to one pixel, layer by layer.
-
-    Args:
-        layers: (L, LAYER_SIZE, LAYER_SIZE, 3).
-
-    Returns:
-        Pixels as red + 256 green + 65536 blue.
-    """
-    count, side = len(layers), LAYER_SIZE
-    levels = np.empty((count, (4 * side * side - 1) // 3), np.int32)
-    _fill_levels(layers, levels)
-    return levels.ravel()
-
-
 @compiled
-def _fill_levels(layers: Any, levels: Any) -> None:
-    """Write the levels in order of size; a pixel is the mean of four pixels of the previous level."""
-    for layer in range(layers.shape[0]):
-        side, start = layers.shape[1], 0
-        for y in range(side):
-            for x in range(side):
-                red, green, blue = layers[layer, y, x, 0], layers[layer, y, x, 1], layers[layer, y, x, 2]
-                levels[layer, y * side + x] = np.int32(red) + np.int32(green) * 256 + np.int32(blue) * 65536
-        while side > 1:
-            end, half = start + side * side, side // 2
-            for y in range(half):
-                for x in range(half):
-                    upper = start + 2 * y * side + 2 * x
-                    pixel = 0
-                    for shift in (0, 8, 16):
-                        total = 2
-                        for at in (upper, upper + 1, upper + side, upper + side + 1):
-                            total += levels[layer, at] >> shift & 255
-                        pixel += total // 4 << shift
-                    levels[layer, end + y * half + x] = pixel
-            side, start = half, end
+def _fill_levels(layer: Any, levels: Any) -> None:
+    """Write the levels of an image in order of size; a pixel is the mean of four pixels of the previous level."""
+    side, start = layer.shape[0], 0
+    for y in range(side):
+        for x in range(side):
+            red, green, blue = layer[y, x, 0], layer[y, x, 1], layer[y, x, 2]
+            levels[y * side + x] = np.int32(red) + np.int32(green) * 256 + np.int32(blue) * 65536
+    while side > 1:
+        end, half = start + side * side, side // 2
+        for y in range(half):
+            for x in range(half):
+                upper = start + 2 * y * side + 2 * x
+                lower = upper + side
+                a, b, c, d = levels[upper], levels[upper + 1], levels[lower], levels[lower + 1]
+                red_blue = (a & 0xFF00FF) + (b & 0xFF00FF) + (c & 0xFF00FF) + (d & 0xFF00FF) + 0x020002
+                green = (a & 0xFF00) + (b & 0xFF00) + (c & 0xFF00) + (d & 0xFF00) + 0x0200
+                levels[end + y * half + x] = (red_blue >> 2 & 0xFF00FF) + (green >> 2 & 0xFF00)
+        side, start = half, end
 
 
 def _full_size(model: mujoco.MjModel, geom: int) -> NDArray[np.float64]:

@@ -13,7 +13,9 @@ from numba.core import caching, config
 
 from mujoco_raster.compiled import compiled
 from mujoco_raster.drawlist import TABLE_LINES, build_draw_list
-from mujoco_raster.geometry import Shapes, Target, clip_space, draw_triangles, find_points, set_planes
+from mujoco_raster.geometry import Shapes, Target, clip_space, draw_triangles, set_planes
+from mujoco_raster.shading import POSITION, ROW
+from mujoco_raster.shapes import distinct_rows
 from mujoco_raster.view import Camera, camera_matrix
 
 # --- compiled functions ---
@@ -61,15 +63,15 @@ def test_draw_list_has_outward_faces() -> None:
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1], group=0)  # not seen
     draw_list = build_draw_list(spec.compile(), groups=(1,))
     assert len(draw_list.geoms) == len(kinds)
-    faces = draw_list.triangles
+    faces, origin = draw_list.triangles, draw_list.vertices.view(np.int32)
     for row, geom in enumerate(draw_list.geoms):
         _, expected = list(kinds.values())[geom]
-        mine = faces[draw_list.vertices["row"][faces[:, 0]] == row]
-        a, b, c = (draw_list.vertices["position"][mine[:, k]].astype(float) for k in range(3))
+        mine = faces[origin[faces[:, 0], ROW] == row]
+        a, b, c = (draw_list.points[origin[mine[:, k], POSITION]].astype(float) for k in range(3))
         assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(expected, rel=0.03)
-        normals = draw_list.vertices["normal"][mine[:, 0]]
+        normals = draw_list.vertices[mine[:, 0], :3]
         assert np.all(np.einsum("ij,ij->i", normals, np.cross(b - a, c - a)) >= -1e-9)
-    np.testing.assert_allclose(np.linalg.norm(draw_list.vertices["normal"], axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(draw_list.vertices[:, :3], axis=1), 1, atol=1e-5)
 
 
 # --- triangles of an image ---
@@ -104,13 +106,10 @@ def test_no_triangle_that_is_skipped_would_show(size: float, distance: float, sq
     assert 0.1 < clip.front.mean() < 0.9
 
 
-def test_points_are_the_distinct_positions_of_each_row() -> None:
-    rng = np.random.default_rng(0)
-    position = rng.integers(0, 4, (5000, 3)).astype(np.float32)
-    row = np.sort(rng.integers(0, 30, 5000)).astype(np.int32)
-    point, first = np.empty(5000, np.int32), np.empty(5000, np.int32)
-    count = find_points(position, row, point, first)
-    keys = np.column_stack([row, position])
-    np.testing.assert_array_equal(keys[first[:count]][point], keys)
-    assert count == len(np.unique(keys, axis=0))
-    assert (np.diff(first[:count]) > 0).all()
+def test_distinct_rows_are_in_order_of_first_use() -> None:
+    rows = np.random.default_rng(0).integers(-3, 3, (5000, 4)).astype(np.int32)
+    distinct, index = distinct_rows(rows)
+    np.testing.assert_array_equal(distinct[index], rows)
+    assert len(distinct) == len(np.unique(rows, axis=0))
+    first = [index.tolist().index(k) for k in range(len(distinct))]
+    assert first == sorted(first)

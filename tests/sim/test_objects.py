@@ -241,12 +241,13 @@ def drawn(text: str) -> NDArray[np.float64]:
     for part in (*spec.meshes, *spec.textures):
         part.file = str(shutil.copy(Path("my_objects/sponge", part.file), folder.absolute()))
     model, draw_list = drawing_model(spec)
-    data, vertices = mujoco.MjData(model), draw_list.vertices
+    data, count = mujoco.MjData(model), int((draw_list.vertices.row < len(draw_list.geoms)).sum())
     mujoco.mj_kinematics(model, data)
-    geoms = draw_list.geoms[vertices["row"].astype(int)]
+    position, normal, uv, row = (values[:count] for values in draw_list.vertices)
+    geoms = draw_list.geoms[row]
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
-    place, normal = (np.einsum("vij,vj->vi", turns, vertices[name][:, :3]) for name in ("position", "normal"))
-    rows = np.concatenate([place + data.geom_xpos[geoms], normal, vertices["uv"]], axis=1).round(4) + 0.0
+    place, normal = (np.einsum("vij,vj->vi", turns, vectors) for vectors in (position, normal))
+    rows = np.concatenate([place + data.geom_xpos[geoms], normal, uv], axis=1).round(4) + 0.0
     return rows[np.lexsort(rows.T)]
 
 

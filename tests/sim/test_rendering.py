@@ -17,6 +17,7 @@ import pytest
 
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.jobs import threads
+from lerobot_memobench.sim import simulation
 from lerobot_memobench.sim.simulation import MJCF_CAMERAS, RenderSettings, Simulation
 from lerobot_memobench.tasks.catalogue import get_task
 from mujoco_raster.highlights import HIGHLIGHTS, Highlight
@@ -67,10 +68,12 @@ def test_threads_have_renderers_of_their_own(simulate: Simulate) -> None:
 
 
 @pytest.mark.parametrize("second_core", [True, False])
-def test_images_drawn_at_once_are_equal(simulate: Simulate, monkeypatch: pytest.MonkeyPatch, second_core: bool) -> None:
-    monkeypatch.setattr(threads, "has_second_core", lambda: second_core)
-    sim = simulate()
+def test_images_drawn_at_once_are_equal(monkeypatch: pytest.MonkeyPatch, second_core: bool) -> None:
+    for module in (threads, simulation):
+        monkeypatch.setattr(module, "has_second_core", lambda: second_core)
     cameras = ["agentview", "wrist"]
+    sim = Simulation(get_task(DRAWER), RenderSettings(40 + second_core, 60))  # a size with rasterizers of its own
+    sim.reset(7)
     expected = [sim.render(camera) for camera in cameras]
     for _ in range(3):
         np.testing.assert_array_equal(sim.render_cameras(cameras), expected)

@@ -20,19 +20,20 @@ import typer
 from rich.text import Text
 
 from lerobot_memobench.cli import data
-from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console, note, run_app, say, table
+from lerobot_memobench.cli.console import AsJson, SuiteOption, as_path, console, counting, note, run_app, say, table
 from lerobot_memobench.cli.data import cache, generate
 from lerobot_memobench.cli.report import compare, export, merge, report, rerun, submit
 from lerobot_memobench.constants import SEALED
 from lerobot_memobench.errors import MemobenchError, count_of
 from lerobot_memobench.evaluation.tables import Unbroken
 from lerobot_memobench.io import in_words
-from lerobot_memobench.jobs.threads import ACTING, LEARNING, use_threads
+from lerobot_memobench.jobs.threads import ACTING, LEARNING, cores, use_threads
 from lerobot_memobench.tasks.catalogue import (
     find_tasks,
     get_task,
     load_task,
     longest_cue_to_use,
+    resolve_tasks,
     suite_of,
     task_folder,
     task_names,
@@ -166,6 +167,22 @@ def assets(
         say(f"copied {in_words(copy_to(to))}; on the other machine, set {ASSETS_VARIABLE} to the copy of {to}")
 
 
+def prepare(
+    suite: SuiteOption = PUBLISHED,
+    tasks: Annotated[str, typer.Option(help="all, memory types or task names, separated by commas.")] = "all",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
+) -> None:
+    """Prepare this machine for its first episodes. Functions are compiled and the meshes of scenes are cached, on all
+    cores.
+    """
+    from lerobot_memobench.sim.preparation import prepare as run
+
+    names = resolve_tasks(tasks, suite)
+    with counting(console(), "scenes", len(names)) as count:
+        for done, name in enumerate(run(names, workers or cores()), 1):
+            count(done, len(names), name)
+
+
 # --- train ---
 
 
@@ -239,14 +256,14 @@ app = typer.Typer(
 )
 
 COMMANDS: dict[str, tuple[Callable[..., int | None], ...]] = {
-    "Look around": (tasks, objects, doctor, assets),
+    "Look around": (tasks, objects, doctor, assets, prepare),
     "Demonstrations": (generate, data.convert, cache, data.view, data.validate, data.describe, data.push),
     "Train": (recipe, conformance),
     "Results": (test_sealed, report, compare, merge, rerun, submit, export),
 }
 """Group -> its commands, as ``memobench --help`` lists them."""
 
-RESUMED = ("generate", "cache", "convert", "push", "assets")
+RESUMED = ("generate", "cache", "convert", "push", "assets", "prepare")
 """Commands that continue when given again; any other starts over."""
 LEARN = ("cache",)  # commands that train or encode in their own process; the others simulate, or compute little
 

@@ -92,9 +92,14 @@ def check_assets() -> Path:
     return located().folder
 
 
+def verified() -> dict[str, Path]:
+    """Return the path of each verified LIBERO file, by the names of `known_hashes`; errors as of `located`."""
+    return _verified(check_assets())
+
+
 def asset(name: str) -> Path:
-    """Return the path of a verified LIBERO file, by one of the names of `known_hashes`; errors as of `located`."""
-    return _verified(check_assets())[name]
+    """Return one path of `verified`."""
+    return verified()[name]
 
 
 def _candidates() -> Iterator[tuple[str, Path]]:

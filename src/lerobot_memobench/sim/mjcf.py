@@ -213,7 +213,8 @@ def _resolved(body: ET.Element, root: ET.Element) -> ET.Element:
 
 def assets_of(root: ET.Element, folder: str) -> list[ET.Element]:
     """Return the assets of a LIBERO file in ``folder`` below the assets folder."""
-    return list(_assets(root, lambda name: files.asset(posixpath.normpath(posixpath.join(folder, name)))))
+    paths = files.verified()
+    return list(_assets(root, lambda name: paths[posixpath.normpath(posixpath.join(folder, name))]))
 
 
 def _assets(root: ET.Element, locate: Callable[[str], Path]) -> Iterator[ET.Element]:

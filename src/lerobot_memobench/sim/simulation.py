@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_memobench.constants import ACTION_DIM
 from lerobot_memobench.errors import MemobenchError, nearest
-from lerobot_memobench.jobs.threads import at_once
+from lerobot_memobench.jobs.threads import at_once, has_second_core
 from lerobot_memobench.sim import robot
 from lerobot_memobench.sim.placement import Placer
 from lerobot_memobench.sim.scene import AGENTVIEW, GLOW, GLOW_OFF, GLOW_ON, GLOW_SITES, Scene, get_scene
@@ -101,7 +101,8 @@ def get_rasterizers(scene: Scene, height: int, width: int) -> dict[str, Rasteriz
         while len(cached) >= CACHED_RASTERIZERS:
             cached.popitem(last=False)
         first = Rasterizer(*scene.drawing(), width, height)
-        cached[key] = dict(zip(MJCF_CAMERAS.values(), (first, first.twin()), strict=True))
+        second = first.twin() if has_second_core() else first
+        cached[key] = dict(zip(MJCF_CAMERAS.values(), (first, second), strict=True))
     cached.move_to_end(key)
     return cached[key]
 

@@ -8,28 +8,37 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Mapping
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
 
-from lerobot_memobench.io import cache_folder, draft_of, file_hash
+from lerobot_memobench.io import cache_folder, file_hash, write_file
+from lerobot_memobench.jobs.threads import cores, sharing_processes
 from lerobot_memobench.sim.asset import VISUAL_GROUP
+from lerobot_memobench.sim.files import known_hashes, verified
 from mujoco_raster.drawlist import MAX_PIECE_TRIANGLES, DrawList, build_draw_list
 from mujoco_raster.shapes import Triangles, in_pieces, triangles_of, welded
 from mujoco_raster.textures import LAYER_SIZE, pixels_of, resized
 
-Arrays = Mapping[str, NDArray[Any]]
-"""Cached content of a file: a NumPy record, which loads in a third of the time of an archive."""
-CACHE_FORMAT = "8"  # version of the cache files; increase it with each change of their content
+type Part = mujoco.MjsMesh | mujoco.MjsTexture
+Arrays = dict[str, NDArray[Any]]
+"""Cached content of a file."""
+CACHE_FORMAT = "9"  # version of the cache files; increase it with each change of their content
 MESH_SETTINGS = ("scale", "refpos", "refquat", "smoothnormal", "inertia")
 TEXTURE_SETTINGS = ("type", "hflip", "vflip", "nchannel", "gridsize", "gridlayout")
 """Attributes of a file's mesh or texture on which cached content depends."""
 THIN_ABOVE, THIN_TO = 6000, 4000
 """Number of triangles above which meshes are simplified, and the target; an object covers a thousandth of an image."""
+_SIMPLIFYING = threading.Lock()  # the library keeps a mesh in global variables, without Python's lock
 MAX_THINNED_SIZE = 0.5  # largest size of simplified meshes, m; larger ones are static and drawn once per scene
 MIN_NORMAL_COSINE = 0.96  # smallest cosine between vertex and face normal of a smooth corner of a simplified mesh
 PLACEHOLDER_POINTS = np.array([(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)], dtype=np.float64)
@@ -47,65 +56,82 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     for mesh in spec.meshes:
         if mesh.name not in drawn and mesh.file:
             _use_placeholder(mesh)
-    files = [(_key(part), part) for part in [*spec.meshes, *spec.textures] if part.file]
-    cached = {key: arrays for key, _ in files if (arrays := _read_cache(key)) is not None}
-    missing = {key: part for key, part in files if key not in cached}
-    if missing:
-        full_model = spec.copy().compile()
-        cached |= {key: _write_cache(key, _extract(full_model, part)) for key, part in missing.items()}
-    meshes, shapes = {}, {}
-    for key, part in files:
-        if isinstance(part, mujoco.MjsMesh):
-            meshes[part.name] = cached[key]
-            vertices = cached[key]["vertices"]
-            shapes[part.name] = vertices[:, :3], vertices[:, 3:6], vertices[:, 6:], cached[key]["triangles"]
+    parts = [part for part in [*spec.meshes, *spec.textures] if part.file]
+    known = {str(path): known_hashes()[name] for name, path in verified().items()}
+    files = [(part, _key(part, known.get(part.file))) for part in parts]
+    contents = {key: _read_cache(key) for _, key in files}
+    for part, key in files:
+        if contents[key]:
             _use_placeholder(part)
-        elif cached[key]["pixels"].size:
-            _replace(part, cached[key]["pixels"])
+    if missing := {key: part for part, key in files if contents[key] is None}:
+        contents |= _read_files(spec, missing)
+        for part, key in files:
+            if contents[key]:
+                _use_placeholder(part)
+    named = [(part.name, contents[key] or {}) for part, key in files]
+    meshes = {name: content for name, content in named if "frame" in content}
+    shapes = {name: (c["position"], c["normal"], c["uv"], c["triangles"]) for name, c in meshes.items()}
+    images = {name: content["pixels"] for name, content in named if "pixels" in content}
     model = spec.compile()
     _set_frames(model, meshes)
-    return model, build_draw_list(model, shapes, (VISUAL_GROUP,), coarse=True)
+    return model, build_draw_list(model, shapes, (VISUAL_GROUP,), images=images, coarse=True)
+
+
+def _read_files(spec: mujoco.MjSpec, missing: Mapping[str, Part]) -> dict[str, Arrays]:
+    """Read and cache the files of some meshes and textures in threads; MuJoCo and NumPy release Python's lock."""
+
+    def read(spec: mujoco.MjSpec, keys: Sequence[str]) -> dict[str, Arrays]:
+        mine = {(type(missing[key]), missing[key].name) for key in keys}
+        for part in [*spec.meshes, *spec.textures]:
+            if part.file and (type(part), part.name) not in mine:
+                _use_placeholder(part)
+        model = spec.compile()
+        return {key: _write_cache(_key(missing[key]), _extract(model, missing[key])) for key in keys}
+
+    keys = sorted(missing, key=lambda key: os.path.getsize(missing[key].file), reverse=True)
+    threads = min(len(keys), max(1, cores() // sharing_processes()))
+    with ThreadPoolExecutor(threads) as pool:
+        shares = pool.map(read, [spec.copy() for _ in range(threads)], [keys[k::threads] for k in range(threads)])
+        contents = {key: content for share in shares for key, content in share.items()}
+    mujoco.mj_clearCache(mujoco.mj_getCache())  # MuJoCo keeps up to 500 MB of files
+    return contents
 
 
 # --- cache files ---
 
 
-def _key(part: mujoco.MjsMesh | mujoco.MjsTexture) -> str:
+def _key(part: Part, file: str | None = None) -> str:
+    """Return the name of the content of a mesh or texture, from its settings and the hash of its file."""
     names = MESH_SETTINGS if isinstance(part, mujoco.MjsMesh) else TEXTURE_SETTINGS
     settings = [np.asarray(getattr(part, name)).tolist() for name in names]
-    facts = CACHE_FORMAT, mujoco.__version__, LAYER_SIZE, file_hash(Path(part.file)), settings
+    facts = CACHE_FORMAT, mujoco.__version__, LAYER_SIZE, file or file_hash(Path(part.file)), settings
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:24]
 
 
 def _path(key: str) -> Path:
-    return cache_folder() / "libero" / f"{key}.npy"
+    return cache_folder() / "libero" / f"{key}.safetensors"
 
 
 def _read_cache(key: str) -> Arrays | None:
-    with contextlib.suppress(OSError, ValueError, EOFError):  # missing or damaged
-        arrays: Arrays = np.load(_path(key), allow_pickle=False)[0]
-        return arrays
+    with contextlib.suppress(OSError, SafetensorError):  # missing or damaged
+        return load_file(_path(key))
     return None
 
 
 def _write_cache(key: str, arrays: Arrays) -> Arrays:
-    record = np.empty(1, [(name, array.dtype, array.shape) for name, array in arrays.items()])
-    for name, array in arrays.items():
-        record[name] = array
     path = _path(key)
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with draft_of(path) as draft:
-            np.save(draft, record)
+        write_file(path, save(arrays))
     return arrays
 
 
-def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) -> Arrays:
-    """Return the content to cache of a compiled mesh or texture; no pixels unless it is square with three channels."""
+def _extract(model: mujoco.MjModel, part: Part) -> Arrays:
+    """Return the content to cache of a compiled mesh or texture; none of a texture with another shape or channels."""
     if isinstance(part, mujoco.MjsTexture):
         texture = model.tex(part.name)
         if texture.nchannel[0] != 3 or texture.height[0] != texture.width[0]:
-            return {"pixels": np.zeros(0, np.uint8)}
+            return {}
         return {"pixels": resized(pixels_of(model, texture.id))}
     mesh = model.mesh(part.name).id
     shown = np.flatnonzero((model.geom_dataid == mesh) & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value))
@@ -113,8 +139,8 @@ def _extract(model: mujoco.MjModel, part: mujoco.MjsMesh | mujoco.MjsTexture) ->
     material = model.geom_matid[shown[0]]
     textured = material >= 0 and model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB.value] >= 0
     shape = triangles_of(model, int(shown[0]))
-    *vertices, triangles = in_pieces(welded(_thinned(shape) if textured else shape), MAX_PIECE_TRIANGLES)
-    return {"frame": frame, "vertices": np.concatenate(vertices, axis=1), "triangles": triangles}
+    position, normal, uv, triangles = in_pieces(welded(_thinned(shape) if textured else shape), MAX_PIECE_TRIANGLES)
+    return {"frame": frame, "position": position, "normal": normal, "uv": uv, "triangles": triangles}
 
 
 def _thinned(shape: Triangles) -> Triangles:
@@ -129,10 +155,11 @@ def _thinned(shape: Triangles) -> Triangles:
     np.add.at(smooth, same, normals)
     faces = same[triangles]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
-    _, _, collapses = fast_simplification.simplify(
-        spots, faces, target_count=THIN_TO, agg=5, return_collapses=True, preserve_border=True
-    )
-    corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
+    with _SIMPLIFYING:
+        _, _, collapses = fast_simplification.simplify(
+            spots, faces, target_count=THIN_TO, agg=5, return_collapses=True, preserve_border=True
+        )
+        corners, thin, moved = fast_simplification.replay_simplification(spots, faces, collapses)
     if len(thin) > 2 * THIN_TO:  # the texture has so many borders that it would be distorted between them
         return shape
     # Collapsed vertices take texture coordinates and normal of the nearest original vertex.
@@ -151,16 +178,15 @@ def _thinned(shape: Triangles) -> Triangles:
 # --- placeholders ---
 
 
-def _use_placeholder(mesh: mujoco.MjsMesh) -> None:
+def _use_placeholder(part: Part) -> None:
+    """Replace a mesh by a box, and a texture by a pixel."""
+    part.file = ""
+    if isinstance(part, mujoco.MjsTexture):
+        part.nchannel, part.height, part.width, part.data = 3, 1, 1, bytes(3)
+        return
     faces = [corner for a, b, c, d in PLACEHOLDER_FACES for corner in (a, b, c, a, c, d)]
-    mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
-    mesh.uservert, mesh.userface = (0.01 * PLACEHOLDER_POINTS).ravel().tolist(), faces
-
-
-def _replace(texture: mujoco.MjsTexture, pixels: NDArray[np.uint8]) -> None:
-    texture.file, texture.nchannel, texture.colorspace = "", 3, mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
-    texture.height, texture.width = pixels.shape[:2]
-    texture.data = pixels.tobytes()
+    part.scale, part.refpos, part.refquat = [1.0] * 3, [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+    part.uservert, part.userface = (0.01 * PLACEHOLDER_POINTS).ravel().tolist(), faces
 
 
 def _set_frames(model: mujoco.MjModel, meshes: Mapping[str, Arrays]) -> None:
