@@ -69,8 +69,8 @@ class Rasterizer:
         self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
         self._upper = _upper_side(draw_list, len(triangles))
 
-    def twin(self) -> Rasterizer:
-        """Return a rasterizer of the same draw list with its own buffers, for another camera or thread."""
+    def copy(self) -> Rasterizer:
+        """Return a rasterizer of the same draw list with buffers of its own, for another camera or thread."""
         other = copy.copy(self)
         other._scene_lights, other._table = copy.deepcopy(self._scene_lights), self._table.copy()
         other._clip = clip_space(self._shapes)

@@ -101,7 +101,7 @@ def get_rasterizers(scene: Scene, height: int, width: int) -> dict[str, Rasteriz
         while len(cached) >= CACHED_RASTERIZERS:
             cached.popitem(last=False)
         first = Rasterizer(*scene.drawing(), width, height)
-        second = first.twin() if has_second_core() else first
+        second = first.copy() if has_second_core() else first
         cached[key] = dict(zip(MJCF_CAMERAS.values(), (first, second), strict=True))
     cached.move_to_end(key)
     return cached[key]
