@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import importlib
 import re
+import statistics
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -21,6 +24,7 @@ SMALLEST = {
     "memory_cost": "--memory none bank --steps 30 --repeats 1",
     "mujoco_renderers": "--frames 1 --backends egl",
     "object_update": "src --rounds 1 --memory frames",
+    "speed": "--turns 1 --tasks put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
     "step_with_objects": "--steps 5 --repeats 1 --tasks 1",
 }
 """Script -> arguments."""
@@ -43,6 +47,57 @@ def test_benchmark_runs(name: str, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "error" not in done.stdout
     assert done.stdout
+
+
+# --- benchmarks/speed.py ---
+
+
+def test_speed_prints_a_row_for_each_operation_on_a_scene() -> None:
+    arguments = ["--tables", "scenes", "--turns", "1", "--tasks", "put_the_butter_into_the_bowl_from_the_prompt_video"]
+    command = [sys.executable, str(BENCHMARKS / "speed.py"), *arguments]
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    rows = re.findall(r"^\| ([a-z ]+) \| [\d.,]+ / [\d.,]+ \|$", output, flags=re.MULTILINE)
+    firsts = [f"first scene {of}" for of in ("of a process", "of a task", "on a machine")]
+    assert sorted(rows) == [*firsts, "reset", "step with two images", "step without images"]
+
+
+@pytest.fixture
+def benchmark(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], ModuleType]:
+    """Return a function that imports a benchmark."""
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    return importlib.import_module
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--tasks", "stack_the_bowl"], "found no task named 'stack_the_bowl'"),
+        (["--former", "/"], "/ holds no src/lerobot_memobench; expected a checkout"),
+        (["--stock", "no/python"], "no/python is no program; expected the Python of stock LIBERO"),
+        (["--turns", "0"], "expected at least 1"),
+    ],
+)
+def test_speed_refuses_what_it_cannot_measure(
+    arguments: list[str], message: str, benchmark: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["speed.py", *arguments])
+    with pytest.raises(SystemExit, match=message):
+        benchmark("speed").main()
+
+
+def test_ratios_are_to_the_first_side(
+    benchmark: Callable[[str], ModuleType], capsys: pytest.CaptureFixture[str]
+) -> None:
+    here, stock = [[1.0, 3.0], [3.0, 3.0]], [[8.0, 9.0]]
+    rows = {"step": {"here": here, "stock": stock}, None: {"stock": stock}, "reset": {"here": [[1000.0, 0.5]]}}
+    benchmark("turns").print_table("ms", rows, statistics.mean, 10.0)
+    assert capsys.readouterr().out.splitlines() == [
+        "| ms | here | stock | ratio |",
+        "|---|---:|---:|---:|",
+        "| step | 20.0 / 30.0 | 80.0 / 90.0 | 4.00 / 3.00 |",
+        "| reset | 10,000 / 5.00 | – | – |",
+        "",
+    ]
 
 
 # --- scripts/trace.py ---
