@@ -56,28 +56,30 @@ class Rasterizer:
     def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, averaged: int = 1) -> None:
         self._list, self._width, self._height = draw_list, width, height
         self._scene_lights = SceneLights(model)
-        self._table = np.zeros((len(draw_list.materials), TABLE_LINES, 4), np.float32)
-        vertices, triangles = draw_list.vertices, draw_list.triangles
-        origin, texels = vertices.view(np.int32), draw_list.texels.ravel()
-        self._shapes = _shapes(draw_list)
-        self._surfaces = Surfaces(vertices, origin, texels, LAYER_SIZE, float(averaged * LAYER_SIZE**2))
+        self._shapes, vertices = _shapes(draw_list), draw_list.vertices
+        self._surfaces = Surfaces(
+            *(vertices, vertices.view(np.int32), draw_list.texels.ravel(), LAYER_SIZE),
+            float(averaged * LAYER_SIZE**2),
+        )
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
         self._sky = draw_list.objects + np.arange(draw_list.sky, dtype=np.int32)
-        self._clip = clip_space(self._shapes)
-        self._work = scratch(len(vertices), len(triangles), width * height)
-        self._target = Target(np.zeros((height, width), np.float32), np.zeros((height, width), np.int32))
-        self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
-        self._upper = _upper_side(draw_list, len(triangles))
+        self._upper = _upper_side(draw_list, len(draw_list.triangles))
+        self._allocate()
 
     def copy(self) -> Rasterizer:
         """Return a rasterizer of the same draw list with buffers of its own, for another camera or thread."""
         other = copy.copy(self)
-        other._scene_lights, other._table = copy.deepcopy(self._scene_lights), self._table.copy()
-        other._clip = clip_space(self._shapes)
-        other._work = scratch(len(self._surfaces.origin), len(self._shapes.triangles), self._width * self._height)
-        other._target = Target(np.zeros_like(self._target.depth), np.zeros_like(self._target.triangle))
-        other._still = OrderedDict()
+        other._scene_lights = copy.deepcopy(self._scene_lights)
+        other._allocate()
         return other
+
+    def _allocate(self) -> None:
+        shape, triangles = (self._height, self._width), len(self._list.triangles)
+        self._table = np.zeros((len(self._list.materials), TABLE_LINES, 4), np.float32)
+        self._clip = clip_space(self._shapes)
+        self._work = scratch(len(self._list.vertices), triangles, self._height * self._width)
+        self._target = Target(np.zeros(shape, np.float32), np.zeros(shape, np.int32))
+        self._still: OrderedDict[bytes, dict[bytes, Background]] = OrderedDict()
 
     # --- draw -----------------------------------------------------------------------------------------------
 
