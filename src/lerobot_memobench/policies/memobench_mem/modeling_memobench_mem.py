@@ -74,8 +74,6 @@ logger = logging.getLogger(__name__)
 LANGUAGE = (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
 AT_ONCE = 32
 """Frames that are kept, at most, until they are encoded in one batch."""
-ROUNDED_ALIKE = 4
-"""Number of rows from which on MKL rounds the plan of a row as in any larger batch."""
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -291,21 +289,19 @@ class MemobenchMemPolicy(PreTrainedPolicy):
     def _plan_new(self, batch: dict[str, Tensor], rows: list[int]) -> list[Tensor]:
         """Return the chunks (chunk, A) of rows, on the CPU.
 
-        Most plans of strict tasks are made in holds, from the inputs of the plan before: they are not computed again,
-        except to fill a batch up to the size at which a plan has the bits of a plan of all rows.
+        Most plans of strict tasks are made in holds, from the inputs of the plan before: they are not computed again.
         """
         self.write_kept()
-        envs, noise, size = [self.rollout.envs[row] for row in rows], self._noise(rows), min(len(rows), ROUNDED_ALIKE)
+        envs, noise = [self.rollout.envs[row] for row in rows], self._noise(rows)
         inputs = [*zip(noise, *self._inputs(batch, rows).values(), strict=True)]
-        repeated = [n for n, env in enumerate(envs) if env.repeats(size, inputs[n])]
-        if len(repeated) < len(rows):
-            del repeated[: max(0, size - len(rows) + len(repeated))]
-            new = [n for n in range(len(rows)) if n not in repeated]
+        new = [n for n, env in enumerate(envs) if not env.repeats(inputs[n])]
+        for n, env in enumerate(envs):
+            if self._watched and n not in new:
+                env.reads.append({**env.reads[-1], "step": env.position})
+        if new:
             chunks = self.plan(batch, [rows[n] for n in new], noise[new]).float().cpu()
             for n, chunk in zip(new, chunks, strict=True):
-                envs[n].planned = envs[n].memory, size, [value.clone() for value in inputs[n]], chunk
-        for env in (envs[n] for n in repeated if self._watched):
-            env.reads.append({**env.reads[-1], "step": env.position})
+                envs[n].planned = envs[n].memory, [value.clone() for value in inputs[n]], chunk
         return [env.planned[-1] for env in envs if env.planned is not None]
 
     def _check_thread(self) -> None:

@@ -33,8 +33,7 @@ class EnvMemory:
     missed: int | None = None  # step of the first frame that should have been written and was not observed
     seed: int = 0
     queue: deque[Tensor] = field(default_factory=deque)  # remaining planned actions
-    planned: tuple[Any, int, Sequence[Tensor], Tensor] | None = None
-    """Memory of the last plan, rows planned with it, other inputs, and the chunk (n, A)."""
+    planned: tuple[Any, Sequence[Tensor], Tensor] | None = None  # the last plan: memory, other inputs, chunk (n, A)
     last: Tensor | None = None  # the last action (A,)
     pose: Tensor | None = None  # of the hand when the last chunk was planned
     skipped: int = 0  # actions of that chunk that were left out
@@ -45,12 +44,12 @@ class EnvMemory:
         self.queue.clear()
         self.last = self.pose = None
 
-    def repeats(self, rows: int, inputs: Sequence[Tensor]) -> bool:
-        """Return whether a plan of so many ``rows`` from the present memory and ``inputs`` would be the last one."""
+    def repeats(self, inputs: Sequence[Tensor]) -> bool:
+        """Return whether the last plan had the same memory and ``inputs``."""
         if self.planned is None or self.missed is not None:
             return False
-        memory, size, last, _ = self.planned
-        return memory is self.memory and size == rows and all(map(torch.equal, last, inputs))
+        memory, last, _ = self.planned
+        return memory is self.memory and all(map(torch.equal, last, inputs))
 
     def begin_chunk(self, chunk: Tensor, count: int, state: Tensor | None = None) -> None:
         """Queue the first ``count`` actions of a chunk (n, A), or the following ones if the hand has stalled.
