@@ -112,32 +112,64 @@ def cpu_noise(shape: tuple[int, ...], device: torch.device) -> Tensor:
     return torch.randn(shape).to(device)
 
 
-def planning(rows: int, **fields: Any) -> Part:
-    """Return the part that fills the memories of ``rows`` environments, then times frames and plans."""
+def planning(rows: int, change: Callable[[Any], None] = lambda model: None, **fields: Any) -> Part:
+    """Return the part that fills the memories of ``rows`` environments, then times frames and plans.
+
+    ``frame_ms`` is of a frame encoded alone, ``frames_ms`` of `MEMORY_FRAMES` encoded together. ``change`` is made to
+    the model first; ``changed_by`` is its effect on the actions, as a share of the largest one.
+    """
 
     def part(size: str, device: str, steps: int) -> dict[str, Any]:
-        policy = random_policy(config(size, device=device, dtype="bfloat16", **fields)).eval()
+        torch.manual_seed(0)
+        dtype = "float32" if device == "cpu" else "bfloat16"  # which a CPU emulates
+        policy = random_policy(config(size, device=device, dtype=dtype, **fields)).eval()
         batch = {key: value.to(device) for key, value in observation(policy.config, rows).items()}
-        policy.reset()
+        noise = torch.randn(rows, policy.config.chunk_size, policy.config.max_action_dim)
+
+        def observe(frames: int) -> None:
+            for _ in range(frames):
+                policy.observe(batch)
+            policy.write_kept()
+
+        def plan() -> Tensor:
+            with torch.no_grad():
+                return policy.plan(batch, [*range(rows)], noise)
+
         started = time.perf_counter()
-        for _ in range(MEMORY_FRAMES):
-            policy.observe(batch)
-        policy.predict_action_chunk(batch)
-        first, _ = time.perf_counter() - started, peak()
-        frames, plans = [], []
-        for turn in range(steps + WARM_UP):
-            frame, plan = timed(policy.observe, batch), timed(policy.predict_action_chunk, batch)
-            if turn >= WARM_UP:
-                frames.append(frame)
-                plans.append(plan)
-        return {
-            "plan_ms": round(1e3 * statistics.median(plans), 1),
-            "frame_ms": round(1e3 * statistics.median(frames), 2),
-            "first_s": round(first, 1),
-            "peak_gib": peak(),
-        }
+        observe(MEMORY_FRAMES)
+        unchanged = plan()
+        first = time.perf_counter() - started
+        change(policy.model)
+        effect = (plan() - unchanged).abs().max() / unchanged.abs().max()
+        peak()
+        parts = {"plan_ms": plan, "frame_ms": lambda: observe(1), "frames_ms": lambda: observe(MEMORY_FRAMES)}
+        seconds: dict[str, list[float]] = {name: [] for name in parts}
+        for _ in range(steps + WARM_UP):
+            for name, call in parts.items():
+                seconds[name].append(timed(call))
+        median = {name: round(1e3 * statistics.median(taken[WARM_UP:]), 2) for name, taken in seconds.items()}
+        return {**median, "changed_by": round(float(effect), 6), "first_s": round(first, 1), "peak_gib": peak()}
 
     return part
+
+
+def compile_denoising(model: Any) -> None:
+    """Compile a step of denoising; on a GPU it is captured in a CUDA graph."""
+    on_gpu: dict[str, Any] = {"mode": "reduce-overhead"}
+    options = on_gpu if next(model.parameters()).is_cuda else {"backend": "aot_eager"}  # without a compiler of C++
+    model.velocity = torch.compile(model.velocity, fullgraph=True, **options)
+
+
+def narrow_tower(model: Any) -> None:
+    """Let the image tower compute in bfloat16."""
+    perception = model.paligemma_with_expert.perception
+    narrow = torch.bfloat16
+
+    def prefix(observed: Tensor) -> Tensor:
+        states = perception.tower.to(narrow)(observed.to(narrow)).last_hidden_state
+        return perception.projector.to(narrow)(states).to(observed.dtype)  # type: ignore[no-any-return]
+
+    perception.prefix = prefix
 
 
 def updating(ddp: bool, **fields: Any) -> Part:
@@ -182,6 +214,8 @@ PARTS: dict[str, Part] = {
     "plan": planning(1),
     "plan, 8 environments": planning(8),
     "plan, no memory": planning(1, memory="none"),
+    "plan, compiled": planning(1, compile_denoising),
+    "plan, bfloat16 tower": planning(1, narrow_tower),
     "update": updating(ddp=False),
     "update, DDP of one": updating(ddp=True),
 }

@@ -176,6 +176,7 @@ class Actor:
 
     def _tick(self) -> None:
         self.batch[OBS_STEP] = torch.full((1, 1), float(self.step))
+        self.batch[OBS_RAW_STATE] = torch.randn(1, 8)  # no frame and no plan is repeated
         self.step += 1
 
     def turn(self) -> None:

@@ -65,6 +65,7 @@ def test_datasets_of_other_robots(
         assert found.shape == (1, action)
         assert found.isfinite().all()
     assert config.memory_camera == next(iter(cameras))
+    policy.write_kept()
     stored = [frame.step for frame in policy.rollout.envs[0].memory[0]]
     assert stored == [*range(0, 5, config.memory_stride)]
 

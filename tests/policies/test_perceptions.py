@@ -28,6 +28,7 @@ from lerobot_memobench.envs.settings import PIXELS
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.perception.detector import Detector, save_detector
 from lerobot_memobench.perception.visual_encoder import GRID, POOLED, WIDTH, VisualEncoder
+from lerobot_memobench.policies.memobench_mem import modeling_memobench_mem
 from lerobot_memobench.policies.memobench_mem.encoders import encoded_key
 from lerobot_memobench.policies.memobench_mem.fusion import MemoryPass
 from lerobot_memobench.policies.memobench_mem.memory.mechanism import EXACT, FRAMES, PLACES
@@ -177,6 +178,27 @@ def test_rollout_remembers_and_sees_what_training_reads(case: Case) -> None:
         prefix = policy.model.embed(policy._observed(batch | {key: trained[key] for key in PROMPT_KEYS}), MemoryPass())
         prefixes.append(prefix.tokens[prefix.real])
     assert difference(*prefixes) <= 2 * case.of.rounding
+
+
+def test_remembered_frames_are_encoded_together(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, before, _, dataset = case.shared
+    policy.eval()
+    remember, encoded, kept = policy.perception.remember, list[int](), []
+
+    def counted(batch: Any, rows: Any) -> Tensor:
+        encoded.append(len(rows))
+        return remember(batch, rows)  # type: ignore[no-any-return]
+
+    monkeypatch.setattr(policy.perception, "remember", counted)
+    for at_once in (5, 1):
+        monkeypatch.setattr(modeling_memobench_mem, "AT_ONCE", at_once)
+        policy.reset()
+        for frame in range(case.starts[1], case.starts[1] + 13):
+            policy.observe(before(case.observed(dataset, frame)))
+        kept.append(remembered(policy, [0])[0])
+    assert encoded == [*([1] * 7 if "perception" in case.fields else [5, 2]), *[1] * 7]
+    assert kept[0][1] == kept[1][1]
+    assert difference(kept[0][0], kept[1][0]) <= case.of.rounding
 
 
 def test_memory_is_trained_and_images_encoders_are_not(case: Case) -> None:

@@ -128,6 +128,35 @@ def test_a_stalled_hand_goes_on_in_its_chunk(root: Path, monkeypatch: pytest.Mon
     ]
 
 
+def test_plans_are_not_repeated_in_a_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Row 0 acts from frame 4 on, whose observations are equal in 4 ... 9 and 14 ... 17; those of row 1 in 5 ... 12."""
+    policy, before, _, dataset = made_for_training(make_held_dataset(tmp_path / "data"), **OBJECTS)
+    draw_modulation(policy)
+    plan, planned = policy.plan, dict[int, list[int]]()
+
+    def act(corrupted: int | None = None) -> Tensor:
+        actions = list[Tensor]()
+        policy.reset()
+        planned.clear()
+        monkeypatch.setattr(policy, "plan", lambda *call: planned.update({len(actions): call[1]}) or plan(*call))
+        for step in range(20):
+            if step == corrupted:
+                policy.corrupt_memory("noise", [1])
+            actions.append(policy.select_action(before(observed(dataset, step, HELD_LENGTHS[0] + step))))
+        return torch.stack(actions)
+
+    acted, without = (
+        act(),
+        {0: [1], 3: [1], 4: [0], 6: [1], 10: [0], 13: [0], 15: [1], 16: [0], 18: [1], 19: [0]},
+    )
+    assert planned == without
+    act(corrupted=7)
+    assert planned == without | {9: [1]}
+    monkeypatch.setattr(EnvMemory, "repeats", lambda *_: False)
+    assert torch.equal(act(), acted)
+    assert planned == without | {7: [0], 9: [1], 12: [1]}
+
+
 STATE = torch.tensor([0.1, 0.2, 1.0, 3.13, 0.1, 0.0, 0.04, -0.04])
 AXIS = torch.tensor([0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0])
 

@@ -98,6 +98,7 @@ def trained_on(batch: Mapping[str, Tensor]) -> list[tuple[Tensor, list[int]]]:
 def remembered(policy: Any, rows: Sequence[int]) -> list[tuple[Tensor, list[int]]]:
     """Return the remembered frames of rows of a policy's rollout, and their control steps."""
     found = []
+    policy.write_kept()
     for row in rows:
         (kept,) = policy.rollout.envs[row].memory
         read = [kept[slot] for slot in sample_frames(len(kept) - 1, policy.model.memory.settings.frames)]

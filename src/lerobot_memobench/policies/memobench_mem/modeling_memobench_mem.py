@@ -72,6 +72,8 @@ from lerobot_memobench.policies.memobench_mem import processor_memobench_mem  # 
 logger = logging.getLogger(__name__)
 
 LANGUAGE = (OBS_LANGUAGE_TOKENS, OBS_LANGUAGE_ATTENTION_MASK)
+AT_ONCE = 32
+"""Frames that are kept, at most, until they are encoded in one batch."""
 OWN_MODULES = (
     *("model.memory", "model.memory_to_expert", "alignment", "model.foresight", "model.subgoal"),
     *("model.state_token", "model.instruction", "paligemma_with_expert.perception"),
@@ -235,6 +237,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         self._calls = self._planned = 0
         self._thread = threading.get_ident()
         self._acting: list[EnvMemory] = []
+        self._kept: list[tuple[list[tuple[EnvMemory, int]], dict[str, Tensor]]] = []  # see `_keep`
 
     def corrupt_memory(self, how: str, rows: Sequence[int]) -> None:
         """Change what environments (numbers in the batch) remember, before the next frame; planned actions are kept.
@@ -244,6 +247,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         """
         memory, envs = self.model.memory, self.rollout.envs
         assert memory is not None  # `rollouts.plan` refuses others
+        self.write_kept()
 
         def noised(row: int) -> Any:
             return memory.noised(envs[row].memory, torch.Generator().manual_seed(envs[row].seed))
@@ -272,15 +276,33 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         phases = _column(batch, OBS_PHASE) or [EXECUTION] * len(envs)
         acting = [row for row, env in enumerate(envs) if phases[row] != PROMPT and not env.frozen]
         if due := [row for row in acting if not envs[row].queue]:
-            chunks = self.plan(batch, due, self._noise(due))
+            chunks = self._plan_new(batch, due)
             states = batch[OBS_RAW_STATE] if self.config.uses_objects and not self.open_loop else None
-            for row, chunk in zip(due, chunks.float().cpu(), strict=True):
+            for row, chunk in zip(due, chunks, strict=True):
                 envs[row].begin_chunk(chunk, self.config.n_action_steps, None if states is None else states[row])
         self._acting = [envs[row] for row in acting]
         for env in self._acting:
             env.last = env.queue.popleft()
         none = torch.zeros(self._action_dim)
         return torch.stack([none if env.last is None else env.last for env in envs]).to(self._device)
+
+    def _plan_new(self, batch: dict[str, Tensor], rows: list[int]) -> list[Tensor]:
+        """Return the chunks (chunk, A) of rows, on the CPU.
+
+        Most plans of strict tasks are made in holds, from the inputs of the plan before: they are not computed again.
+        """
+        self.write_kept()
+        envs, noise = [self.rollout.envs[row] for row in rows], self._noise(rows)
+        inputs = [*zip(noise, *self._inputs(batch, rows).values(), strict=True)]
+        new = [n for n, env in enumerate(envs) if not env.repeats(inputs[n])]
+        for n, env in enumerate(envs):
+            if self._watched and n not in new:
+                env.reads.append({**env.reads[-1], "step": env.position})
+        if new:
+            chunks = self.plan(batch, [rows[n] for n in new], noise[new]).float().cpu()
+            for n, chunk in zip(new, chunks, strict=True):
+                envs[n].planned = envs[n].memory, [value.clone() for value in inputs[n]], chunk
+        return [env.planned[-1] for env in envs if env.planned is not None]
 
     def _check_thread(self) -> None:
         # LeRobot's env.max_parallel_tasks would mix several rollouts.
@@ -303,31 +325,50 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         steps = steps or [self._calls] * len(batch[name])
         self._calls += 1
         clocks = list(zip(phases or [EXECUTION] * len(steps), steps, strict=True))
-        started = self.rollout.observe(clocks, lambda rows: self._write(batch, rows))
+        started = self.rollout.observe(clocks, lambda rows: self._keep(batch, rows))
         observed = [key for key in (name, OBS_STATE, OBS_LANGUAGE_TOKENS) if key in batch]
         for row, (env, begins) in enumerate(zip(self.rollout.envs, started, strict=True)):
             if begins:
                 env.draw_seed(batch[key][row] for key in observed)
 
+    def _inputs(self, batch: dict[str, Tensor], rows: list[int]) -> dict[str, Tensor]:
+        """Return what memory and plans of some rows of a batch depend on."""
+        names = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, OBS_PHASE, CHOICES, *LANGUAGE}
+        return {key: value[rows] for key, value in batch.items() if key in names or key.startswith(ENCODED)}
+
+    def _keep(self, batch: dict[str, Tensor], rows: list[int]) -> None:
+        """Keep frames for `write_kept`, with the environments and control steps in which they are observed."""
+        envs = [(self.rollout.envs[row], self.rollout.envs[row].position) for row in rows]
+        self._kept.append((envs, self._inputs(batch, rows)))
+        # On a GPU detections depend on the size of the batch, and repeated ones are recognised by their bits.
+        if self.config.skips_repeated_frames or sum(len(envs) for envs, _ in self._kept) >= AT_ONCE:
+            self.write_kept()
+
     @torch.no_grad()
-    def _write(self, batch: dict[str, Tensor], rows: list[int]) -> None:
+    def write_kept(self) -> None:
+        """Encode the observed frames in one batch, and write them to the memories; a plan does so before it reads."""
         memory, skips = self.model.memory, self.config.skips_repeated_frames
-        assert memory is not None
-        frames = self.perception.remember(batch, rows).to(self._device)
+        kept, self._kept = self._kept, []
+        if not kept or memory is None:
+            return
+        places = [place for envs, _ in kept for place in envs]
+        batch = {key: torch.cat([inputs[key] for _, inputs in kept]) for key in kept[0][1] if key not in LANGUAGE}
+        frames = self.perception.remember(batch, range(len(places))).to(self._device)
         with self.precision.computing(self._device):
-            for row, frame in zip(rows, frames.split(1), strict=True):  # one by one, so that they are independent
-                env = self.rollout.envs[row]
+            # One by one, so that rows are independent.
+            for number, ((env, step), frame) in enumerate(zip(places, frames.split(1), strict=True)):
                 if skips and env.memory is not None and env.stored is not None and torch.equal(frame, env.stored):
                     continue
                 env.stored = frame
-                query = self._query(batch, [row], writes=True)
+                query = self._query(batch, [number], writes=True)
                 state = memory.init(1) if env.memory is None else env.memory
-                env.memory = memory.observe(state, frame, torch.tensor([env.position], device=self._device), query)
+                env.memory = memory.observe(state, frame, torch.tensor([step], device=self._device), query)
 
     def remembered(self, batch: dict[str, Tensor], rows: Sequence[int]) -> MemoryTokens:
         """Return the memory tokens that chunks of some rows of the batch would read now."""
         memory = self.model.memory
         assert memory is not None
+        self.write_kept()
         return memory.read(memory.join([self.rollout.envs[row].memory for row in rows]), self._query(batch, rows))
 
     def plan(self, batch: dict[str, Tensor], rows: list[int], noise: Tensor, training: bool = False) -> Tensor:
@@ -335,9 +376,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
 
         A ``training`` batch has its own histories; its labels are not read.
         """
-        inputs = {*self.config.image_features, OBS_ENV_STATE, OBS_RAW_STATE, OBS_STATE, *LANGUAGE}
-        part = {key: value[rows] for key, value in batch.items() if key in inputs or key.startswith(ENCODED)}
-        seen, memory = self._observed(part), None
+        seen, memory = self._observed(self._inputs(batch, rows)), None
         with self.precision.computing(self._device):
             if training:
                 memory = self.read_memory(_without_labels(batch))
@@ -358,6 +397,8 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         """Start or stop recording how much each chunk reads of the remembered entries, for `memory_reads`."""
         self.config.check_memory_reads()
         self._watched = watched
+        for env in self.rollout.envs:
+            env.planned = None
 
     def memory_reads(self) -> list[list[Chunk]]:
         return [env.reads for env in self.rollout.envs]

@@ -33,6 +33,7 @@ class EnvMemory:
     missed: int | None = None  # step of the first frame that should have been written and was not observed
     seed: int = 0
     queue: deque[Tensor] = field(default_factory=deque)  # remaining planned actions
+    planned: tuple[Any, Sequence[Tensor], Tensor] | None = None  # the last plan: memory, other inputs, chunk (n, A)
     last: Tensor | None = None  # the last action (A,)
     pose: Tensor | None = None  # of the hand when the last chunk was planned
     skipped: int = 0  # actions of that chunk that were left out
@@ -42,6 +43,13 @@ class EnvMemory:
         """Discard planned actions; the action is zero until the next plan."""
         self.queue.clear()
         self.last = self.pose = None
+
+    def repeats(self, inputs: Sequence[Tensor]) -> bool:
+        """Return whether the last plan had the same memory and ``inputs``."""
+        if self.planned is None or self.missed is not None:
+            return False
+        memory, last, _ = self.planned
+        return memory is self.memory and all(map(torch.equal, last, inputs))
 
     def begin_chunk(self, chunk: Tensor, count: int, state: Tensor | None = None) -> None:
         """Queue the first ``count`` actions of a chunk (n, A), or the following ones if the hand has stalled.
