@@ -86,6 +86,7 @@ def _read_files(spec: mujoco.MjSpec, missing: Mapping[str, Part]) -> dict[str, A
             if part.file and (type(part), part.name) not in mine:
                 _use_placeholder(part)
         model = spec.compile()
+        # A file may have changed since it was verified, so its content is cached under its present hash.
         return {key: _write_cache(_key(missing[key]), _extract(model, missing[key])) for key in keys}
 
     keys = sorted(missing, key=lambda key: os.path.getsize(missing[key].file), reverse=True)
