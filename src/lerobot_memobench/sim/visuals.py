@@ -38,6 +38,7 @@ TEXTURE_SETTINGS = ("type", "hflip", "vflip", "nchannel", "gridsize", "gridlayou
 """Attributes of a file's mesh or texture on which cached content depends."""
 THIN_ABOVE, THIN_TO = 6000, 4000
 """Number of triangles above which meshes are simplified, and the target; an object covers a thousandth of an image."""
+SHARES = 8  # of missing files, read one after another in each thread; fewer take up to 0.4 GB more memory
 _SIMPLIFYING = threading.Lock()  # the library keeps a mesh in global variables, without Python's lock
 MAX_THINNED_SIZE = 0.5  # largest size of simplified meshes, m; larger ones are static and drawn once per scene
 MIN_NORMAL_COSINE = 0.96  # smallest cosine between vertex and face normal of a smooth corner of a simplified mesh
@@ -86,15 +87,15 @@ def _read_files(spec: mujoco.MjSpec, missing: Mapping[str, Part]) -> dict[str, A
             if part.file and (type(part), part.name) not in mine:
                 _use_placeholder(part)
         model = spec.compile()
+        mujoco.mj_clearCache(mujoco.mj_getCache())  # MuJoCo keeps up to 500 MB of files
+        # A file may have changed since it was verified, so its content is cached under its present hash.
         return {key: _write_cache(_key(missing[key]), _extract(model, missing[key])) for key in keys}
 
     keys = sorted(missing, key=lambda key: os.path.getsize(missing[key].file), reverse=True)
-    threads = min(len(keys), max(1, cores() // sharing_processes()))
-    with ThreadPoolExecutor(threads) as pool:
-        shares = pool.map(read, [spec.copy() for _ in range(threads)], [keys[k::threads] for k in range(threads)])
-        contents = {key: content for share in shares for key, content in share.items()}
-    mujoco.mj_clearCache(mujoco.mj_getCache())  # MuJoCo keeps up to 500 MB of files
-    return contents
+    shares = [keys[k::SHARES] for k in range(min(SHARES, len(keys)))]
+    with ThreadPoolExecutor(max(1, cores() // sharing_processes())) as pool:
+        contents = [*pool.map(read, [spec.copy() for _ in shares], shares)]
+    return {key: content for share in contents for key, content in share.items()}
 
 
 # --- cache files ---
