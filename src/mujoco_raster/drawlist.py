@@ -140,7 +140,7 @@ def build_draw_list(
     parts += [(0, 0, disc())] * HIGHLIGHTS
     materials += [_DISC] * HIGHLIGHTS
     ends = np.cumsum([0, *(len(shape[0]) for _, _, shape in parts)]).tolist()
-    corners, vertices = np.empty((ends[-1], 4), np.int32), np.empty((ends[-1], RECORD), np.float32)
+    corners, vertices = np.empty((ends[-1], 4), np.int32), np.zeros((ends[-1], RECORD), np.float32)
     for row, (_, _, shape) in enumerate(parts):
         mine = slice(ends[row], ends[row + 1])
         corners[mine, 0], corners.view(np.float32)[mine, 1:] = row, shape[0]

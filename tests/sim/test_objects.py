@@ -20,6 +20,7 @@ from lerobot_memobench.sim import files, mjcf
 from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.visuals import drawing_model
 from lerobot_memobench.tasks.catalogue import get_task, load_task
+from mujoco_raster.shading import POSITION, ROW
 from tests.sim.conftest import DRAWER
 
 CLASSES = sorted(folder.name for folder in files.OWN_OBJECTS.iterdir())
@@ -241,10 +242,11 @@ def drawn(text: str) -> NDArray[np.float64]:
     for part in (*spec.meshes, *spec.textures):
         part.file = str(shutil.copy(Path("my_objects/sponge", part.file), folder.absolute()))
     model, draw_list = drawing_model(spec)
-    data, count = mujoco.MjData(model), int((draw_list.vertices.row < len(draw_list.geoms)).sum())
+    data, origin = mujoco.MjData(model), draw_list.vertices.view(np.int32)
     mujoco.mj_kinematics(model, data)
-    position, normal, uv, row = (values[:count] for values in draw_list.vertices)
-    geoms = draw_list.geoms[row]
+    count = int((origin[:, ROW] < len(draw_list.geoms)).sum())
+    geoms, position = draw_list.geoms[origin[:count, ROW]], draw_list.points[origin[:count, POSITION]]
+    normal, uv = draw_list.vertices[:count, :3], draw_list.vertices[:count, 3:5]
     turns = data.geom_xmat[geoms].reshape(-1, 3, 3)
     place, normal = (np.einsum("vij,vj->vi", turns, vectors) for vectors in (position, normal))
     rows = np.concatenate([place + data.geom_xpos[geoms], normal, uv], axis=1).round(4) + 0.0
