@@ -13,7 +13,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from mujoco_raster.shading import POSITION, RECORD, ROW
 from mujoco_raster.shapes import (
     Triangles,
     box_cells,
@@ -31,6 +30,8 @@ DEFAULT_GROUPS = (0, 1, 2)
 TABLE_LINES = 5
 """Lines of four numbers per row of the table: pose (3), colour, material."""
 
+POSITION, ROW, RECORD = 5, 6, 8
+"""Columns of a vertex that are integers, and the number of columns."""
 MAX_PIECE_TRIANGLES = 2000
 """Largest number of mesh triangles per row; rows outside the image are skipped."""
 
@@ -57,7 +58,8 @@ class DrawList:
 
     Attributes:
         points: (P, 3) positions in the frames of the rows; first_point: (rows + 1,).
-        vertices: (N, 8), see `shading.Surfaces`.
+        vertices: (N, 8), normals in the frames of the rows (3) and texture coordinates (2); as integers, the position
+            and the row in columns `POSITION` and `ROW`.
         triangles: (M, 3) vertex indices, counter-clockwise from outside.
         geoms: (rows of geoms,) geom ids.
         sites: (rows of sites,) site ids.

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoco_raster.compiled import compiled
-from mujoco_raster.drawlist import TABLE_LINES, DrawList, Floats, Image, Mirror
+from mujoco_raster.drawlist import POSITION, ROW, TABLE_LINES, DrawList, Floats, Image, Mirror
 from mujoco_raster.errors import RasterError
 from mujoco_raster.geometry import Integers, Shapes, Target, clip_space, draw_triangles, set_planes
 from mujoco_raster.highlights import Highlight, fill_table
-from mujoco_raster.shading import IMAGE, POSITION, ROW, TRANSLUCENT, Surfaces, scratch, shade
+from mujoco_raster.shading import IMAGE, TRANSLUCENT, Surfaces, scratch, shade
 from mujoco_raster.textures import LAYER_SIZE
 from mujoco_raster.view import Camera, Lights, SceneLights, camera_matrix, clipping, cropped, mirrored, model_camera
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mujoco_raster.compiled import compiled
+from mujoco_raster.drawlist import POSITION, ROW
 
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int32]
@@ -24,8 +25,6 @@ these loops, because numba checks signed ones for negative values, which prevent
 STRIDE = BATCH + CHUNK
 ATTRIBUTES = 5
 """Attributes per vertex: light (3), texture coordinates (2)."""
-POSITION, ROW, RECORD = 5, 6, 8
-"""Columns of the integers of a vertex, and the numbers of its record."""
 IMAGE, TRANSLUCENT = 0, 1
 """Output modes: write the image, blend over the image."""
 
@@ -44,8 +43,7 @@ _TINY = np.float32(1e-30)
 class Surfaces(NamedTuple):
     """Vertex attributes and textures of a scene.
 
-    ``vertices``: (N, 8), normals in the frames of the rows (3) and texture coordinates (2); ``origin``: the same memory
-    as integers, with the position in `Shapes` and the row in columns `POSITION` and `ROW`; ``texels``: all levels of
+    ``vertices``: (N, 8), see `drawlist.DrawList`; ``origin``: the same memory as integers; ``texels``: all levels of
     all layers, one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two;
     ``detail``: its area, times the pixels that are averaged to one.
     """

@@ -45,6 +45,17 @@ def test_image_in_a_process_without_display_and_gl(model_file: Path, tmp_path: P
     np.testing.assert_array_equal(np.asarray(Image.open(image)), renderer.render())
 
 
+def test_a_second_process_compiles_nothing(model_file: Path, tmp_path: Path) -> None:
+    """Numba reads its cache while modules are imported: a circular import would discard it without a message."""
+    command = [sys.executable, "-W", "ignore", "-m", "mujoco_raster", str(model_file), str(tmp_path / "image.png")]
+    for _ in range(2):
+        done = subprocess.run(
+            command, env={**os.environ, "NUMBA_DEBUG_CACHE": "1"}, check=True, capture_output=True, text=True
+        )
+    assert "data loaded" in done.stdout
+    assert "data saved" not in done.stdout
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "variables",

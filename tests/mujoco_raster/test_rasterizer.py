@@ -12,9 +12,8 @@ import pytest
 from numba.core import caching, config
 
 from mujoco_raster.compiled import compiled
-from mujoco_raster.drawlist import TABLE_LINES, build_draw_list
+from mujoco_raster.drawlist import POSITION, ROW, TABLE_LINES, build_draw_list
 from mujoco_raster.geometry import Shapes, Target, clip_space, draw_triangles, set_planes
-from mujoco_raster.shading import POSITION, ROW
 from mujoco_raster.shapes import distinct_rows
 from mujoco_raster.view import Camera, camera_matrix
 

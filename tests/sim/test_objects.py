@@ -20,7 +20,7 @@ from lerobot_memobench.sim import files, mjcf
 from lerobot_memobench.sim.scene import get_scene
 from lerobot_memobench.sim.visuals import drawing_model
 from lerobot_memobench.tasks.catalogue import get_task, load_task
-from mujoco_raster.shading import POSITION, ROW
+from mujoco_raster.drawlist import POSITION, ROW
 from tests.sim.conftest import DRAWER
 
 CLASSES = sorted(folder.name for folder in files.OWN_OBJECTS.iterdir())
