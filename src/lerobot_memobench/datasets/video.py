@@ -137,13 +137,18 @@ class ImageHistograms:
 
     def __init__(self) -> None:
         self._counts: list[NDArray[np.int32]] = []
+        self._frame: NDArray[np.uint8] | None = None
 
     def add(self, frame: NDArray[np.uint8]) -> None:
         """Add the next frame, (H, W, 3) uint8."""
         import cv2
 
+        if self._frame is not None and np.array_equal(frame, self._frame):  # most frames of a strict task are held
+            self._counts.append(self._counts[-1])
+            return
         counts = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
         self._counts.append(np.array(counts, dtype=np.int32))
+        self._frame = frame.copy()
 
     def stats(self, *, sampled: bool = False) -> Stats:
         """Return LeRobot's statistics: each (3, 1, 1), in [0, 1], and ``count`` (1,), exact over the pixels.
