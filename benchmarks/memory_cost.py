@@ -38,6 +38,7 @@ from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import Memo
 from lerobot_memobench.policies.memobench_mem.network import MemoryPI05
 from lerobot_memobench.policies.memobench_mem.objects import OBS_RAW_STATE, frame_row
 from lerobot_memobench.policies.memobench_mem.processor_memobench_mem import GatherMemoryProcessorStep
+from lerobot_memobench.policies.memobench_mem.texts import texts_of
 from lerobot_memobench.sim.object_layout import SIZE
 from lerobot_memobench.training.loop import keep_freed_memory
 
@@ -155,7 +156,8 @@ def policy_inputs(settings: MemobenchMemConfig, rows: int) -> dict[str, Tensor]:
 
 def choices(settings: MemobenchMemConfig, rows: int) -> dict[str, Tensor]:
     """Return the mask of allowed subgoals, for a memory that selects a subgoal: all are allowed."""
-    return {CHOICES: torch.ones(rows, len(settings.subgoal_texts), dtype=torch.bool)} if settings.subgoals else {}
+    texts = len(texts_of(settings.subgoals or {}))
+    return {CHOICES: torch.ones(rows, texts, dtype=torch.bool)} if texts else {}
 
 
 # -- a rollout --------------------------------------------------------------------------------------------------------

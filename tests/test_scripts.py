@@ -21,7 +21,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SMALLEST = {
     "dataset_writing": "--episodes 1 --repeats 1 --ways write",
     "gpu": "--size tiny --device cpu --steps 1 --out {folder}/gpu.jsonl",
-    "memory_cost": "--memory none bank --steps 30 --repeats 1",
+    "memory_cost": "--memory none bank subgoal --steps 30 --repeats 1",
     "mujoco_renderers": "--frames 1 --backends egl",
     "object_update": "src --rounds 1 --memory frames",
     "speed": "--turns 1 --tasks put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate",
