@@ -83,6 +83,11 @@ class DrawList:
     mirror: Mirror | None = None
 
     @property
+    def origin(self) -> NDArray[np.int32]:
+        """The memory of ``vertices`` as integers, (N, 8)."""
+        return self.vertices.view(np.int32)
+
+    @property
     def objects(self) -> int:
         """Number of rows of geoms and sites."""
         return len(self.geoms) + len(self.sites)

@@ -56,9 +56,9 @@ class Rasterizer:
     def __init__(self, model: mujoco.MjModel, draw_list: DrawList, width: int, height: int, averaged: int = 1) -> None:
         self._list, self._width, self._height = draw_list, width, height
         self._scene_lights = SceneLights(model)
-        self._shapes, vertices = _shapes(draw_list), draw_list.vertices
+        self._shapes = _shapes(draw_list)
         self._surfaces = Surfaces(
-            *(vertices, vertices.view(np.int32), draw_list.texels.ravel(), LAYER_SIZE),
+            *(draw_list.vertices, draw_list.origin, draw_list.texels.ravel(), LAYER_SIZE),
             float(averaged * LAYER_SIZE**2),
         )
         self._rows = np.arange(draw_list.objects, dtype=np.int32)
@@ -338,7 +338,7 @@ def _upper_side(draw_list: DrawList, triangles: int) -> NDArray[np.bool_]:
 
 def _row_of(draw_list: DrawList) -> Integers:
     """Return the row of each triangle, (T,)."""
-    rows: Integers = draw_list.vertices.view(np.int32)[draw_list.triangles[:, 0], ROW]
+    rows: Integers = draw_list.origin[draw_list.triangles[:, 0], ROW]
     return rows
 
 
@@ -348,7 +348,7 @@ def _shapes(draw_list: DrawList) -> Shapes:
     first_triangle = np.searchsorted(_row_of(draw_list), np.arange(len(first_point))).astype(np.int32)
     low, high = (f.reduceat(points, first_point[:-1], axis=0) for f in (np.minimum, np.maximum))
     centre, half = 0.5 * (low + high), 0.5 * (high - low) + np.float32(1e-6)
-    position, corners = np.ascontiguousarray(points.T), draw_list.vertices.view(np.int32)[triangles, POSITION]
+    position, corners = np.ascontiguousarray(points.T), draw_list.origin[triangles, POSITION]
     planes = np.empty((4, len(triangles)), np.float32)
     set_planes(position, corners, planes)
     return Shapes(triangles, corners, position, first_point, first_triangle, planes, centre, half)

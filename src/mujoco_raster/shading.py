@@ -43,9 +43,9 @@ _TINY = np.float32(1e-30)
 class Surfaces(NamedTuple):
     """Vertex attributes and textures of a scene.
 
-    ``vertices``: (N, 8), see `drawlist.DrawList`; ``origin``: the same memory as integers; ``texels``: all levels of
-    all layers, one byte of red, green and blue each per integer; ``side``: side of the first level, a power of two;
-    ``detail``: its area, times the pixels that are averaged to one.
+    ``vertices`` and ``origin``: (N, 8), see `drawlist.DrawList`; ``texels``: all levels of all layers, one byte of red,
+    green and blue each per integer; ``side``: side of the first level, a power of two; ``detail``: its area, times the
+    pixels that are averaged to one.
     """
 
     vertices: Floats
@@ -107,7 +107,7 @@ def shade(
     Args:
         shapes, table, clip, target: after a call of `geometry.draw_triangles`.
         surfaces: `Surfaces`.
-        lights: `lights.Lights`.
+        lights: `view.Lights`.
         eye: position of the camera, (3,).
         work: `Scratch`.
         mode: `IMAGE` or `TRANSLUCENT`.

@@ -62,7 +62,7 @@ def test_draw_list_has_outward_faces() -> None:
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[1, 1, 1], group=0)  # not seen
     draw_list = build_draw_list(spec.compile(), groups=(1,))
     assert len(draw_list.geoms) == len(kinds)
-    faces, origin = draw_list.triangles, draw_list.vertices.view(np.int32)
+    faces, origin = draw_list.triangles, draw_list.origin
     for row, geom in enumerate(draw_list.geoms):
         _, expected = list(kinds.values())[geom]
         mine = faces[origin[faces[:, 0], ROW] == row]

@@ -242,7 +242,7 @@ def drawn(text: str) -> NDArray[np.float64]:
     for part in (*spec.meshes, *spec.textures):
         part.file = str(shutil.copy(Path("my_objects/sponge", part.file), folder.absolute()))
     model, draw_list = drawing_model(spec)
-    data, origin = mujoco.MjData(model), draw_list.vertices.view(np.int32)
+    data, origin = mujoco.MjData(model), draw_list.origin
     mujoco.mj_kinematics(model, data)
     count = int((origin[:, ROW] < len(draw_list.geoms)).sum())
     geoms, position = draw_list.geoms[origin[:count, ROW]], draw_list.points[origin[:count, POSITION]]

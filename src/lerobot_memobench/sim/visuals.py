@@ -61,14 +61,11 @@ def drawing_model(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, DrawList]:
     known = {str(path): known_hashes()[name] for name, path in verified().items()}
     files = [(part, _key(part, known.get(part.file))) for part in parts]
     contents = {key: _read_cache(key) for _, key in files}
+    if missing := {key: part for part, key in files if contents[key] is None}:
+        contents |= _read_files(spec, missing)
     for part, key in files:
         if contents[key]:
             _use_placeholder(part)
-    if missing := {key: part for part, key in files if contents[key] is None}:
-        contents |= _read_files(spec, missing)
-        for part, key in files:
-            if contents[key]:
-                _use_placeholder(part)
     named = [(part.name, contents[key] or {}) for part, key in files]
     meshes = {name: content for name, content in named if "frame" in content}
     shapes = {name: (c["position"], c["normal"], c["uv"], c["triangles"]) for name, c in meshes.items()}
