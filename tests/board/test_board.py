@@ -62,6 +62,14 @@ def test_valid_submission_is_accepted(board: Path) -> None:
     assert row.rates["SR"].value == pytest.approx(0.6)
 
 
+def test_intervals_of_plans_and_memory_are_shown(board: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    for memory, stride, known in (("frames", 8, 8), ("none", 8, None), ("frames", "<b>", None)):
+        in_card(lambda card, m=memory, s=stride: card["policy"]["settings"].update(memory=m, memory_stride=s))(folder)
+        row = page.board_row(read_submission(folder))
+        assert (row.replan, row.memory_stride) == (5, known)
+
+
 def test_board_of_the_repository_is_valid() -> None:
     rows = page.board_rows(ROOT / "results" / "board")
     assert {row.name: row.rerun for row in rows} == dict.fromkeys((row.name for row in rows), True)

@@ -210,6 +210,31 @@ def test_flaws_fail_their_checks(check: str, window: Subject) -> None:
         window.policy.__class__ = base
 
 
+class ReadsEveryFrame:
+    """Its window in rollouts holds successive frames."""
+
+    def window(self: Any, row: Any) -> Any:
+        shown = list(row.past)[-self.config.frames :]
+        padding = self.config.frames - len(shown)
+        return torch.stack([shown[0]] * padding + shown), torch.arange(self.config.frames) < padding
+
+
+@pytest.mark.parametrize("planted", ["only at plans", "every frame"])
+def test_intervals_of_training_and_rollouts_are_named(window: Subject, planted: str) -> None:
+    """The window has every second frame in training. At plans alone, every third step, it has every second plan's."""
+    base, check = type(window.policy), "remembers every control step"
+    conforming = Behaviour(window)
+    assert (run_check(check, conforming).outcome, conforming.interval) == (PASSED, 2)
+    every = type("ReadsEveryFrame", (ReadsEveryFrame, base), {})
+    window.policy.__class__, found = {"only at plans": (flaws(base)[check], 6), "every frame": (every, 1)}[planted]
+    try:
+        result = run_check(check, Behaviour(window))
+    finally:
+        window.policy.__class__ = base
+    assert result.outcome is FAILED
+    assert f"every 2 control steps in training and every {found} in rollouts" in result.sentence
+
+
 def test_other_history_in_training_fails(window: Subject, monkeypatch: pytest.MonkeyPatch) -> None:
     reader = window.dataset.reader
     deltas = reader.delta_indices.items()

@@ -11,10 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from lerobot_memobench.board.rules import SEEDS
 from lerobot_memobench.board.submission import PAUSES, About
-from lerobot_memobench.envs.evaluation_file import INPUTS
+from lerobot_memobench.envs.evaluation_file import INPUTS, POLICY
 from lerobot_memobench.evaluation.comparison import compare_evaluations
 from lerobot_memobench.evaluation.evidence import Evidence
 from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, stand_ins_of
@@ -38,6 +39,8 @@ class BoardRow:
         rates, evidence: averages.
         pauses: change of SR by the pauses.
         without_memory: SR of the partner without a memory.
+        replan: executed actions of each plan.
+        memory_stride: control steps between updates of the memory, where the policy's settings name them.
     """
 
     name: str
@@ -53,6 +56,8 @@ class BoardRow:
     evidence: Evidence | None
     pauses: Contrast | None
     without_memory: Rate | None
+    replan: int | None
+    memory_stride: int | None
 
 
 def board_rows(board: Path) -> list[BoardRow]:
@@ -88,7 +93,16 @@ def board_row(
         evidence=evaluation.evidence.average if evaluation.evidence else None,
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
         without_memory=None if partner is None else partner.evaluation.summary.average["SR"],
+        replan=evaluation.replan_steps,
+        memory_stride=memory_stride(evaluation.card[POLICY].get("settings", {})),
     )
+
+
+def memory_stride(settings: Mapping[str, Any]) -> int | None:
+    """Return the control steps between updates of a policy's memory; None without a memory, or if they are unknown."""
+    remembers = settings.get("use_visual_memory") or settings.get("memory") not in (None, "none")
+    stride = settings.get("memory_stride") if remembers else None
+    return stride if isinstance(stride, int) else None  # a card may hold any value
 
 
 # --- the table ---
@@ -109,7 +123,7 @@ HEAD = (
         "suite",
         "assets",
     ),
-    *("inputs", "parameters", "training data", "episodes of each task", "run by us"),
+    *("inputs", "plan interval", "parameters", "training data", "episodes of each task", "run by us"),
 )
 UNRANKED = 1000
 """Value by which rows without a rank are sorted."""
@@ -141,6 +155,7 @@ def _line(rank: int | None, row: BoardRow) -> str:
         _pauses(row.pauses),
         _rate(row.without_memory),
         *((escape(text), text) for text in (row.suite, row.assets, row.inputs)),
+        _interval(row.replan, row.memory_stride),
         (NOT_APPLICABLE if count is None else f"{count:,}", -1 if count is None else count),
         (escape(about.training_data), about.training_data),
         (f"{row.episodes}<br><small>{escape(row.seeds)}</small>", row.episodes),
@@ -163,6 +178,12 @@ def _evidence(evidence: Evidence | None) -> Cell:
         return NOT_APPLICABLE, -1
     follows, chance = evidence.rates["follows"], percent_text(evidence.chance)
     return f"{with_interval(follows.value, follows.low, follows.high)}, chance {chance}", follows.value or 0
+
+
+def _interval(replan: int | None, memory: int | None) -> Cell:
+    """Return the control steps between plans, and between updates of the memory: ``6, memory 8``."""
+    text = NOT_APPLICABLE if replan is None else str(replan)
+    return text if memory is None else f"{text}<br><small>memory {memory}</small>", -1 if replan is None else replan
 
 
 def _pauses(change: Contrast | None) -> Cell:

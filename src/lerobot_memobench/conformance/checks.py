@@ -9,9 +9,10 @@ frame changes actions of later plans, it is remembered.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +91,12 @@ class Behaviour:
         return frames if self.changes(frames[-1:])[frames[-1]] > 0 else self.plans
 
     @cached_property
+    def interval(self) -> int | None:
+        """Control steps between the past frames that a plan reads; None where they differ, or fewer than two are."""
+        plans = self.all_plans
+        return only_step([f for f, change in self.by_frame.items() if f < plan and change[plan] > 0] for plan in plans)
+
+    @cached_property
     def after_two(self) -> Actions:
         """The actions (calls, A) of the first stream in the row after the second one."""
         return self.subject.roll([self.two, self.one])[:, 1]
@@ -125,6 +132,21 @@ class Behaviour:
         # Not `>`, so that NaN differs.
         calls = np.flatnonzero(~(np.abs(actions[:length] - other[:length]) <= self.tolerance).all(axis=-1))
         return int(calls[0]) if len(calls) else None
+
+
+def trained_interval(config: Any) -> int | None:
+    """Return the control steps between frames of a policy's history in training; None if its configuration has none.
+
+    They are its ``memory_stride``, or the step of its ``observation_delta_indices``.
+    """
+    stride = getattr(config, "memory_stride", None)
+    return only_step([config.observation_delta_indices or []]) if stride is None else int(stride)
+
+
+def only_step(series: Iterable[Sequence[int]]) -> int | None:
+    """Return the difference of successive numbers in every series; None without one, or with several."""
+    steps = {int(step) for numbers in series for step in np.diff(numbers)}
+    return steps.pop() if len(steps) == 1 else None
 
 
 def run_check(name: str, behaviour: Behaviour) -> Result:
@@ -233,12 +255,18 @@ def _remembers_between_plans(behaviour: Behaviour) -> CheckVerdict:
     between = [frame for frame in behaviour.by_frame if frame not in behaviour.plans]
     if not between:
         return PASSED, "it plans at every control step"
+    config = behaviour.subject.policy.config
+    trained, found, differ = trained_interval(config), behaviour.interval, ""
+    if trained != found and None not in (trained, found):
+        differ = f"the history has a frame every {trained} control steps in training and every {found} in rollouts; "
     if any(behaviour.later(frame) for frame in between):
+        if differ and config.observation_delta_indices:  # else a memory may choose among the frames that it is shown
+            return FAILED, f"{differ}read the frames that observation_delta_indices names"
         return PASSED, "frames between two plans change later ones"
     if any(behaviour.later(frame) for frame in behaviour.plans):
         return FAILED, (
-            "frames at which it plans are remembered, those between two plans are not, so its history depends on "
-            "n_action_steps: remember the frame at every call of select_action, also while actions are queued"
+            f"{differ}frames at which it plans are remembered, those between two plans are not, so its history depends "
+            "on n_action_steps: remember the frame at every call of select_action, also while actions are queued"
         )
     return NOT_CHECKED, (
         f"none of {len(behaviour.one) - behaviour.one.start} execution frames changes a later plan: it remembers the "
