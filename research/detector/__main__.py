@@ -24,12 +24,15 @@ Workers = Annotated[int, typer.Option(min=1, help="Processes that make images.")
 def train(
     out: Annotated[Path, typer.Option(help="Folder of images, checkpoint and weights; the same command resumes.")],
     tasks: Tasks = None,
-    episodes: Episodes = 8,
+    episodes: Episodes = 2,
     frames: Frames = 22,
     first_seed: Annotated[int, typer.Option(help="First seed of the episodes, 30000 to 39999.")] = 30_000,
-    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 18_000,
+    updates: Annotated[int, typer.Option(min=1, help="Updates of the weights.")] = 2000,
     batch: Annotated[int, typer.Option(min=1, help="Images of each.")] = 32,
     seed: Annotated[int, typer.Option(min=0, help="Of first weights, order and augmentation.")] = 0,
+    start: Annotated[
+        str | None, typer.Option(help="Detector to begin with, a file or package; from random weights by default.")
+    ] = None,
     workers: Workers = 1,
 ) -> None:
     """Make labelled images of the benchmark and train a visual encoder and detector on them."""
@@ -42,7 +45,7 @@ def train(
     data = DetectorData(_names(tasks), first_seed, episodes, frames, workers)
     with counting(screen, "episodes") as count, counting(screen, "updates", updates) as learned:
         pictures = data.pictures(out / "pictures", TRAINED, lambda at: _count(count, at))
-        settings = Training(updates=updates, batch=batch, seed=seed)
+        settings = Training(updates=updates, batch=batch, seed=seed, start=start)
         file = train_detector(pictures, kinds(), out, settings, progress=learned)
     screen.print(f"detector: {file}", soft_wrap=True)
 

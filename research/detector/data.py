@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -130,7 +131,7 @@ class EpisodeImages:
         episode = _episode(self.name)
         rng = generator(episode.published, self.seed, SCENE_STREAM)
         states = expert_states(episode, self.seed, self.frames)
-        scenes = _Scenes(episode.sim, rng)
+        scenes = Scenes(episode.sim, rng)
         rows = [row for state in states for row in scenes.images(state)]
         with draft_of(self.folder) as draft:
             np.save(draft, np.array(rows, PICTURE))
@@ -173,7 +174,9 @@ def _state(episode: Episode) -> ExpertState:
     return ExpertState(sim.state(), sim.highlights, near)
 
 
-class _Scenes:
+class Scenes:
+    """Make the scenes of states of one episode."""
+
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
         self._sim, self._crowd = sim, with_distractors(sim, rng)
         self._fixed = sim.fixture_poses()
@@ -189,7 +192,12 @@ class _Scenes:
         for scene in range(1, len(SCENES)):
             for _ in range(TRIES):
                 crowd.set_state(widened(state.state, sim, crowd), self._fixed)
-                if self._randomisation.apply(reach=scene == len(SCENES) - 1):
+                try:
+                    free = self._randomisation.apply(reach=scene == len(SCENES) - 1)
+                except mujoco.FatalError:  # two equal boxes may overlap with more contacts than MuJoCo allows
+                    mujoco.mj_resetData(crowd.model, crowd.data)
+                    continue
+                if free:
                     crowd.highlights = self._randomisation.highlights()
                     yield from (self._full.take(camera, scene) for camera in MJCF_CAMERAS)
                     break

@@ -5,12 +5,24 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
 from lerobot_memobench.errors import MemobenchError
-from research.detector.data import KINDS_FILE, PER_FRAME, TESTED, TRAINED, DetectorData, EpisodeImages, Pictures
-from tests.support.labelled_images import BOWLS, synthetic
+from research.detector.data import (
+    KINDS_FILE,
+    PER_FRAME,
+    TESTED,
+    TRAINED,
+    DetectorData,
+    EpisodeImages,
+    ExpertState,
+    Pictures,
+    Scenes,
+)
+from research.detector.randomisation import DomainRandomisation
+from tests.support.labelled_images import BOWLS, simulation, synthetic
 
 
 @pytest.mark.slow
@@ -28,6 +40,21 @@ def test_an_episode_is_made_once_and_the_same_again(tmp_path: Path) -> None:
     rows = pictures.rows([0, 1])
     assert rows["camera"].tolist() == [0, 1]
     assert (rows["count"] > 0).all()
+
+
+def test_a_scene_that_mujoco_refuses_is_randomised_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    apply, calls = DomainRandomisation.apply, list[bool]()
+
+    def refused_once(self: DomainRandomisation, *, reach: bool) -> bool:
+        calls.append(reach)
+        if len(calls) == 1:
+            raise mujoco.FatalError("mj_narrowphase: collision function returned 9 contacts")
+        return apply(self, reach=reach)
+
+    monkeypatch.setattr(DomainRandomisation, "apply", refused_once)
+    sim = simulation(BOWLS)
+    rows = [*Scenes(sim, np.random.default_rng(0)).images(ExpertState(sim.state(), (), near=False))]
+    assert [int(row["scene"]) for row in rows] == [0, 0, 1, 1, 2, 2]
 
 
 def test_files_are_read_as_one(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from research.detector.training import (
     train,
     train_last,
     uncertainty_loss,
+    unfold,
     whiten,
 )
 from tests.support.labelled_images import (
@@ -186,6 +187,30 @@ def test_whitening_keeps_the_output(tmp_path: Path) -> None:
             assert rows.mean(dim=0).abs().max() < rounding
             assert variances.max() < 1.2
             assert variances[-3:].min() > 0.8
+
+
+@torch.no_grad()
+def test_unfolding_keeps_the_output() -> None:
+    torch.manual_seed(1)
+    detector = Detector(trained_a_little(small_encoder()), ("cork", "cap")).eval()
+    detector.fold()
+    images = torch.rand(8, 3, SIDE, SIDE)
+    before = all_outputs(detector(images))
+    unfold(detector, images)
+    for of_batch in (False, True):  # by the normalisations' own moments, and by the batch's
+        assert all(map(partial(torch.allclose, atol=1e-3), all_outputs(detector.train(of_batch)(images)), before))
+
+
+def test_a_start_goes_on_with_the_weights_of_a_file(pictures: Pictures, tmp_path: Path) -> None:
+    settings = Training(updates=1, batch=4)
+    first = train(pictures, KINDS, tmp_path / "first", settings, encoder=small_encoder)
+    still = replace(settings, start=str(first), rate=0.0)
+    again = load_detector(train(pictures, KINDS, tmp_path / "again", still))
+    images = images_of(pictures.rows(np.arange(12)))
+    with torch.inference_mode():
+        assert torch.allclose(again(images).heatmap, load_detector(first)(images).heatmap, atol=0.1)
+    with pytest.raises(MemobenchError, match="other kinds"):
+        train(pictures, ("red",), tmp_path / "other", still)
 
 
 @pytest.mark.parametrize("cells", CELLS.values(), ids=CELLS)

@@ -14,6 +14,7 @@ from lerobot_memobench.datasets.frames import FrameLookup, read_frame_table
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.training import features as module
 from lerobot_memobench.training.features import EpisodeFeatures, Features, episode_file, features_folder, make_features
+from tests.support.held_dataset import make_held_dataset
 from tests.support.synthetic_dataset import LENGTHS
 
 CAMERA = "observation.images.image"
@@ -87,6 +88,13 @@ def test_name_depends_on_encoder_camera_stride_and_videos(root: Path) -> None:
     video.write_bytes(video.read_bytes() + b"0")
     names.add(features_folder(root, "test", encoder.features(), CAMERA, 1).name)
     assert len(names) == 5
+
+
+def test_a_scene_at_rest_is_encoded_once(tmp_path: Path) -> None:
+    root = make_held_dataset(tmp_path / "data", images=True)
+    expected = [0, 1, 2, 3, *[4] * 6, 10, 11, 12, 13, *[14] * 4, 18, 19, 20, 21, 22, 22]  # of `held_dataset.HOLDS`
+    for stride in (1, 2):
+        assert Encoder().made(root, stride=stride).episode(0)[:, 0, 0].tolist() == expected[::stride]
 
 
 def test_processes_share_the_episodes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

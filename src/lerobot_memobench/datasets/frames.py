@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 
 from lerobot_memobench.constants import OBS_PHASE, PROMPT
 from lerobot_memobench.datasets.demonstration import HELD_COLUMN, LEVEL_COLUMNS, MEMORY_COLUMN
-from lerobot_memobench.datasets.episodes import numbers, read_table, tables_of, texts
+from lerobot_memobench.datasets.episodes import numbers, read_info, read_table, tables_of, texts
 from lerobot_memobench.datasets.layout import OBJECTS, PRIVILEGED, objects_column
 from lerobot_memobench.errors import MemobenchError
 
@@ -205,6 +205,22 @@ def read_recorded(root: Path, names: Sequence[str]) -> tuple[dict[str, Tensor], 
             column = columns.setdefault(name, np.empty((len(table.phase), *values.shape[1:]), values.dtype))
             column[index] = values
     return {name: torch.from_numpy(column) for name, column in columns.items()}, table
+
+
+def repeated(root: Path) -> np.ndarray:
+    """Return whether each frame (N,) has the state and objects of the one before: the scene is at rest.
+
+    Its image is the same, too, but a decoded video differs a little. Without a column of objects no frame is repeated.
+    """
+    features = read_info(root)["features"]
+    if objects_column(features) not in features:
+        return np.zeros(read_frame_table(root).episodes[-1], np.bool_)
+    columns, table = read_recorded(root, ["observation.state", OBJECTS])
+    same = np.ones(len(table.phase), np.bool_)
+    for column in columns.values():
+        same[1:] &= (column[1:] == column[:-1]).all(dim=1).numpy()
+    same[table.episodes[:-1]] = False
+    return same
 
 
 # --- samples ---

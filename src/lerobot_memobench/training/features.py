@@ -3,6 +3,7 @@
 A memory reads up to 32 earlier frames per sample, and a frozen encoder's tokens are needed at every update. They are
 computed once, in ``feature_cache/<name>/`` in the dataset's folder; the name ends with a hash of frames, encoder
 weights, camera and stride. A file that exists is complete. With several processes, each encodes a part of the episodes.
+The features of a scene at rest are those of its first frame, although a decoded video changes a little.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from lerobot_memobench.datasets.episodes import read_info
-from lerobot_memobench.datasets.frames import read_frame_table, read_recorded
+from lerobot_memobench.datasets.frames import read_frame_table, read_recorded, repeated
 from lerobot_memobench.datasets.video import FrameReader, frame_reader
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.io import explaining_disk_errors, files_below, free_bytes, in_words, write_file
@@ -108,7 +109,7 @@ def episode_file(folder: Path, number: int) -> Path:
 
 def features_folder(root: Path, prefix: str, features: Features, camera: str, stride: int) -> Path:
     """Return the folder of a dataset's features: a readable prefix and a hash of all inputs."""
-    parts = (dataset_fingerprint(root, camera), features.key, camera, str(stride))
+    parts = (dataset_fingerprint(root, camera), features.key, camera, str(stride), "rest once")
     return root / FOLDER / f"{prefix}-{hashlib.blake2b(chr(10).join(parts).encode(), digest_size=8).hexdigest()}"
 
 
@@ -152,6 +153,7 @@ def make_features(
             "(policy.memory_stride=)"
         )
     rank, world = rank_of_world()
+    same = repeated(root)
     with explaining_disk_errors(folder), ThreadPoolExecutor(workers or min(cores(), MOST_THREADS)) as pool:
         folder.mkdir(parents=True, exist_ok=True)
         ignored, line = root / ".gitignore", f"/{FOLDER}/"  # which uploads to the hub follow
@@ -159,10 +161,12 @@ def make_features(
         if line not in lines:
             write_file(ignored, "\n".join([*lines, line]) + "\n")
         for number in [number for number in missing if number % world == rank]:
-            frames = [slot * stride for slot in range(counts[number])]
-            parts = [frames[first : first + batch_size] for first in range(0, len(frames), batch_size)]
+            first, end = table.episodes[number : number + 2]
+            _, slots, image = np.unique(np.cumsum(~same[first:end])[::stride], return_index=True, return_inverse=True)
+            frames = (slots * stride).tolist()
+            parts = [frames[start : start + batch_size] for start in range(0, len(frames), batch_size)]
             images = pool.map(functools.partial(read, number), parts)
-            encoded = torch.cat([features.make(part).to("cpu", torch.bfloat16) for part in images])
+            encoded = torch.cat([features.make(part).to("cpu", torch.bfloat16) for part in images])[image]
             write_file(episode_file(folder, number), save({TOKENS: encoded.contiguous()}))
             progress(sum(episode_file(folder, k).is_file() for k in range(table.num_episodes)), table.num_episodes)
     while not all(episode_file(folder, number).is_file() for number in missing):  # other processes encode these

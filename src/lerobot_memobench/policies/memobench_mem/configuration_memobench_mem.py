@@ -76,7 +76,9 @@ IMAGES = Condition("a policy that sees images", lambda config: config.uses_image
 VISUAL_ENCODER = Condition("size=small perception=pixels", lambda config: config.uses_visual_encoder)
 STATE_TOKEN = Condition("a policy whose state is a token", lambda config: config.state_token)
 MEMORY = Condition("a memory", lambda config: config.memory != NONE)
-OBJECT_MEMORY = Condition("a memory of objects other than motion", lambda config: config.skips_repeated_frames)
+OBJECT_MEMORY = Condition(
+    "a memory of objects other than motion", lambda config: config.uses_objects and config.skips_repeated_frames
+)
 TEXT_MEMORY = Condition("a memory that learns from texts", lambda config: config.privileged_memory)
 ALIGNMENT = Condition("an alignment", lambda config: config.align != NONE)
 TEXTS = Condition(
@@ -475,9 +477,9 @@ class MemobenchMemConfig(PreTrainedConfig):
     def skips_repeated_frames(self) -> bool:
         """Whether a frame equal to the last remembered one is not remembered.
 
-        The holds of strict tasks would fill a memory of objects and use up the frames that a chunk reads.
+        The holds of strict tasks would fill the memory and use up the frames that a chunk reads.
         """
-        return self.mechanism is not None and not self.mechanism.asks_motion and self.uses_objects
+        return self.mechanism is not None and not self.mechanism.asks_motion and self.decodes_no_video
 
     def check_memory_reads(self) -> None:
         """Refuse a memory whose fusion cannot report how much a chunk reads of each remembered entry."""
