@@ -119,6 +119,10 @@ DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
     "large log": (lambda folder: (folder / LOG).write_bytes(gzip.compress(b" " * (9 << 20))), "larger than 8.0 MiB"),
     "no log": (lambda folder: (folder / LOG).write_bytes(b"text"), "no whole gzip file"),
     "other task files": (in_card(lambda card: card["task_files"].update({TASKS[0]: "f" * 16})), "the files of"),
+    "long plan": (
+        in_card(lambda card: card["protocol"].update(window_steps=200, replan_steps=1)),
+        "are 201 together; expected at most 200",
+    ),
     "mixed versions": (
         in_card(lambda card: card["runs"].append({**card["runs"][0], "versions": {**VERSIONS, "mujoco": "4.0.0"}})),
         "its parts ran under mujoco",
@@ -135,6 +139,12 @@ def test_doctored_submission_is_refused(board: Path, tmp_path: Path, name: str) 
         check_submission(read_submission(folder))
     assert reason in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_settings_that_follow_from_the_policy_are_accepted(board: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    protocol(window_steps=2, delay_steps=1, convention="libero", robot_state=True)(folder)
+    check_submission(read_submission(folder))
 
 
 DOCTORED_CONTROLS: dict[str, tuple[Callable[[Path], object], str]] = {

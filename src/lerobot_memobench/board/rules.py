@@ -16,7 +16,7 @@ from packaging.version import InvalidVersion
 from lerobot_memobench.board.submission import PAUSES
 from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
 from lerobot_memobench.datasets.generate import task_hash
-from lerobot_memobench.envs.evaluation_file import POLICY, differences
+from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run
@@ -29,10 +29,13 @@ FEWEST, MOST = 10, EVALUATION_EPISODES
 SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
 """Seed of the first episode -> split of seeds that count."""
 MAY_DIFFER = {
-    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
-    *("evidence", "salt"),
-}
+    *("suite", "seed_base", "obs_type", "convention", "referent", "demonstration_prompt", "replan_steps", "evidence"),
+    *OF_ONE_EVALUATION,
+} - {INPUTS}
 """Settings of the protocol that a submission may choose; all others have their defaults."""
+LONGEST_PLAN = 200
+"""Largest number of steps of input window, delay and executed plan together. With longer ones the holds of strict tasks
+have more equal lengths, from which a policy with a clock profits."""
 CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
 REQUIRED = {
     each.name: each.specifier for each in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not each.marker
@@ -86,6 +89,12 @@ def _check_settings(run: Run, **control: Any) -> None:
         )
     if unlike := differences(protocol, fixed, ignore=MAY_DIFFER):
         raise MemobenchError(f"{run.folder}: {unlike[0]} on the board; evaluate with the value of the board")
+    plan = protocol["window_steps"] + protocol["delay_steps"] + (protocol["replan_steps"] or 1)
+    if plan > LONGEST_PLAN:
+        raise MemobenchError(
+            f"{run.folder}: window_steps, delay_steps and replan_steps are {plan} together; expected at most "
+            f"{LONGEST_PLAN}: execute fewer actions of each plan"
+        )
 
 
 def _check_extent(run: Run, names: Sequence[str], fewest: int) -> None:
