@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from lerobot_memobench.board.rules import SEEDS
+from lerobot_memobench.board.rules import SEEDS, supervised_with_answer
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.evaluation_file import INPUTS
 from lerobot_memobench.evaluation.comparison import compare_evaluations
@@ -38,6 +38,7 @@ class BoardRow:
         rates, evidence: averages.
         pauses: change of SR by the pauses.
         without_memory: SR of the partner without a memory.
+        supervised: whether the policy was supervised with the answer; None for a script.
     """
 
     name: str
@@ -53,6 +54,7 @@ class BoardRow:
     evidence: Evidence | None
     pauses: Contrast | None
     without_memory: Rate | None
+    supervised: bool | None
 
 
 def board_rows(board: Path) -> list[BoardRow]:
@@ -88,6 +90,7 @@ def board_row(
         evidence=evaluation.evidence.average if evaluation.evidence else None,
         pauses=next((each for each in changes if each.kind == "average" and each.metric == "SR"), None),
         without_memory=None if partner is None else partner.evaluation.summary.average["SR"],
+        supervised=supervised_with_answer(evaluation, submission.about),
     )
 
 
@@ -106,6 +109,7 @@ HEAD = (
         "follows evidence",
         "change by pauses",
         "without memory, SR",
+        "supervised with the answer",
         "suite",
         "assets",
     ),
@@ -116,6 +120,7 @@ UNRANKED = 1000
 
 Cell = tuple[str, float | str]
 """HTML of a cell, and the value by which it is sorted."""
+SUPERVISED: Mapping[bool | None, Cell] = {True: ("yes", 1), False: ("no", 0), None: (NOT_APPLICABLE, -1)}
 
 
 def table() -> str:
@@ -140,6 +145,7 @@ def _line(rank: int | None, row: BoardRow) -> str:
         _evidence(row.evidence),
         _pauses(row.pauses),
         _rate(row.without_memory),
+        SUPERVISED[row.supervised],
         *((escape(text), text) for text in (row.suite, row.assets, row.inputs)),
         (NOT_APPLICABLE if count is None else f"{count:,}", -1 if count is None else count),
         (escape(about.training_data), about.training_data),

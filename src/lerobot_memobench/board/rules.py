@@ -1,4 +1,4 @@
-"""Rules of the board that an honest evaluation may break: settings, extent, versions, control, sealed seeds.
+"""Rules of the board that an honest evaluation may break: settings, extent, versions, control, sealed seeds, mark.
 
 `check_evaluation` and `check_control` need the evaluation's own files only.
 """
@@ -13,14 +13,15 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
-from lerobot_memobench.board.submission import PAUSES
-from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
+from lerobot_memobench.board.submission import PAUSES, About
+from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, MEMORY_POLICY, PAPER, SEALED, SPLITS
 from lerobot_memobench.datasets.generate import task_hash
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.rollouts.card import PACKAGES
+from lerobot_memobench.rollouts.plan import SCRIPTED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
@@ -57,6 +58,26 @@ def check_evaluation(run: Run, *, part: bool = False, control: str = "") -> None
             f"{run.folder} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
             "others: evaluate them by `memobench test-sealed`"
         )
+
+
+def supervised_with_answer(run: Run, about: About) -> bool | None:
+    """Return whether texts that name the hidden answer supervised a policy in training, None for a script.
+
+    The configuration of `memobench_mem` on the card holds it; for another policy, the submitter states it.
+    """
+    policy = run.card[POLICY]
+    if policy.get("type") in SCRIPTED:
+        return None
+    marked = policy.get("settings", {}).get("supervised_with_answer")
+    if marked is None and policy.get("type") != MEMORY_POLICY:
+        marked = about.supervised_with_answer
+    if not isinstance(marked, bool):
+        raise MemobenchError(
+            f"{run.folder}: found no statement whether the policy was supervised with the answer; expected the setting "
+            f"supervised_with_answer of {MEMORY_POLICY} on the card, as this version writes it, and of another policy "
+            "`memobench submit --supervised-with-answer` or `--no-supervised-with-answer`"
+        )
+    return marked
 
 
 def check_control(run: Run, control: Run, name: str, *, part: bool = False) -> None:
