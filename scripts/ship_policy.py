@@ -35,7 +35,7 @@ from lerobot_memobench.policies.checkpoint import (
     encoded_config,
     shipped_policies,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SUPERVISED, MemobenchMemConfig
 from lerobot_memobench.rollouts.card import git, training_facts
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import DRAWN
@@ -43,8 +43,8 @@ from lerobot_memobench.tasks.task import DRAWN
 TRAINED = "train_config.json"
 LARGEST = 4_000_000
 """Bytes that one policy may take."""
-OF_THE_DATA = ("input_features", "output_features", "object_classes")
-"""Settings of a policy that its dataset decides."""
+FOLLOWING = ("input_features", "output_features", "object_classes", "supervised_with_answer")
+"""Settings of a policy that its dataset or other settings decide."""
 OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
 """Words of an evaluation's command that a card does not repeat."""
 HEAD = """---
@@ -89,10 +89,12 @@ def card(
     begun = runs.pop(0) if "shipped" in runs[0] else None
     policy = runs[-1]["policy"]
     count = sum(value.numel() for value in weights.values()) / 1e6
+    marked = MemobenchMemConfig.from_pretrained(source, cli_overrides=["--device=cpu"]).supervised_with_answer
     lines = [
         f"# {name}",
         "",
         f"`memobench_mem`, {count:.1f} million parameters, bfloat16; reads {policy['perception']}.",
+        *([f"**{SUPERVISED}.**"] if marked else []),
         *([] if begun is None else [began_with(begun["folder"])]),
         *demonstrations(runs, training_facts(source) or {}, merged),
         "",
@@ -156,7 +158,7 @@ def settings(policy: dict[str, Any], before: dict[str, Any] | None = None) -> li
     """Return the settings that differ from the defaults of the policy's size and perception, or from ``before``."""
     usual = encoded_config(MemobenchMemConfig(device="cpu", size=policy["size"], perception=policy["perception"]))
     known = usual | (before or {})
-    given = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *OF_THE_DATA})}
+    given = {key: policy[key] for key in sorted({*usual} & {*policy} - {*ELSEWHERE, *FOLLOWING})}
     return [
         f"policy.{key}={value if isinstance(value, str) else json.dumps(value)}"
         for key, value in given.items()

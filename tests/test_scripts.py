@@ -1,8 +1,9 @@
-"""Scripts of `benchmarks/`, `scripts/trace.py` and the nets: they run, and notice what they look for."""
+"""Scripts of `benchmarks/`, `trace.py`, `ship_policy.py` and the nets: they run, and notice what they look for."""
 
 from __future__ import annotations
 
 import importlib
+import json
 import re
 import statistics
 import subprocess
@@ -13,6 +14,9 @@ from types import ModuleType
 
 import pytest
 
+from lerobot_memobench.policies.checkpoint import TRAIN_CONFIG, encoded_config, shipped_policies
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SUPERVISED, MemobenchMemConfig
+from scripts import ship_policy
 from scripts.nets.mutants import place_of, table
 from scripts.nets.store import ROOT, differences
 from tests.support.scripts import SCRIPTS
@@ -110,6 +114,23 @@ def test_trace_prints_table_and_files() -> None:
     row = re.search(r"^\| words to plan \| (\d+) \| (\d+) \|$", output, flags=re.MULTILINE)
     files = re.findall(r"^    (\S+\.py): ", output, flags=re.MULTILINE)
     assert 5 < len(files) == int(row[1]) <= int(row[2])
+
+
+# --- scripts/ship_policy.py ---
+
+
+def test_card_of_a_shipped_policy_has_its_mark(tmp_path: Path) -> None:
+    config = MemobenchMemConfig(device="cpu", size="small", perception="objects", align="contrastive")
+    config.save_pretrained(tmp_path)
+    run = {"policy": encoded_config(config), "dataset": {"root": "gone"}, "output_dir": "outputs/run"}
+    run |= {"batch_size": 72, "steps": 2000, "seed": 1000}
+    (tmp_path / TRAIN_CONFIG).write_text(json.dumps(run))
+    text = ship_policy.card("mine", tmp_path, {}, None, {})
+    assert f"**{SUPERVISED}.**" in text
+    assert "policy.align=contrastive batch_size" in text
+    for folder in shipped_policies().values():
+        marked = MemobenchMemConfig.from_pretrained(folder, cli_overrides=["--device=cpu"]).supervised_with_answer
+        assert (f"**{SUPERVISED}.**" in (folder / "README.md").read_text()) == marked
 
 
 # --- scripts/nets ---

@@ -91,5 +91,7 @@ PROPRIO_DIM = 8
 
 # -- software
 
+MEMORY_POLICY = "memobench_mem"
+"""Type of the policy with a memory, as LeRobot registers it."""
 PUBLISHED_MUJOCO = "3.9.0"
 """MuJoCo version of the published figures. Scenes start and move slightly differently in other versions."""

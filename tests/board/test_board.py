@@ -23,9 +23,22 @@ from lerobot_memobench.envs.evaluation_file import write_evaluation
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.evidence import evidence_of
 from lerobot_memobench.evaluation.report import HUB_FILE
+from lerobot_memobench.policies.checkpoint import encoded_config
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.tasks.catalogue import get_task
 from tests.support import browser as chromium
-from tests.support.board import ABOUT, TASKS, VERSIONS, evaluation, first_failure, in_card, in_log, sealed, stating
+from tests.support.board import (
+    ABOUT,
+    IMAGES,
+    TASKS,
+    VERSIONS,
+    evaluation,
+    first_failure,
+    in_card,
+    in_log,
+    sealed,
+    stating,
+)
 from tools.board import page
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_partners, check_submission, ranked, read_board
@@ -127,6 +140,14 @@ DOCTORED: dict[str, tuple[Callable[[Path], object], str]] = {
     "large log": (lambda folder: (folder / LOG).write_bytes(gzip.compress(b" " * (9 << 20))), "larger than 8.0 MiB"),
     "no log": (lambda folder: (folder / LOG).write_bytes(b"text"), "no whole gzip file"),
     "other task files": (in_card(lambda card: card["task_files"].update({TASKS[0]: "f" * 16})), "the files of"),
+    "no statement on supervision": (
+        in_card(lambda card: card["submission"].pop("supervised_with_answer")),
+        "whether the policy was supervised with the answer",
+    ),
+    "long plan": (
+        in_card(lambda card: card["protocol"].update(window_steps=200, replan_steps=1)),
+        "are 201 together; expected at most 200",
+    ),
     "mixed versions": (
         in_card(lambda card: card["runs"].append({**card["runs"][0], "versions": {**VERSIONS, "mujoco": "4.0.0"}})),
         "its parts ran under mujoco",
@@ -145,6 +166,12 @@ def test_doctored_submission_is_refused(board: Path, tmp_path: Path, name: str) 
     assert "\n" not in str(refused.value)
 
 
+def test_settings_that_follow_from_the_policy_are_accepted(board: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    protocol(window_steps=2, delay_steps=1, convention="libero", robot_state=True)(folder)
+    check_submission(read_submission(folder))
+
+
 DOCTORED_CONTROLS: dict[str, tuple[Callable[[Path], object], str]] = {
     "log without pauses": (
         in_log(lambda log: [each.pop("paused_steps") for each in log]),
@@ -159,6 +186,69 @@ def test_doctored_control_is_refused(with_controls: Path, tmp_path: Path, name: 
     change, reason = DOCTORED_CONTROLS[name]
     folder = shutil.copytree(with_controls, tmp_path / "two")
     change(folder / "pauses")
+    with pytest.raises(MemobenchError, match=reason):
+        check_submission(read_submission(folder))
+
+
+# --- the mark of supervision with the answer ---
+
+
+def of_memory(recorded: bool | None = None, **settings: Any) -> Callable[[Path], None]:
+    """Make the card one of `memobench_mem` with pixels; ``recorded`` replaces its mark."""
+    config = encoded_config(MemobenchMemConfig(device="cpu", **settings)) | {"input_features": IMAGES}
+    config |= {} if recorded is None else {"supervised_with_answer": recorded}
+    return in_card(lambda card: card["policy"].update(type="memobench_mem", settings=config))
+
+
+@pytest.mark.parametrize(
+    ("change", "marked"),
+    [
+        (of_memory(), False),
+        (of_memory(memory="none"), False),
+        (of_memory(align="contrastive"), True),
+        (of_memory(align="contrastive", align_targets="answers"), True),
+        (of_memory(align="contrastive", align_targets="progress"), False),
+        (of_memory(memory="subgoal"), True),
+        (of_memory(True), True),  # began with a marked checkpoint
+        (stating("supervised_with_answer", True), True),
+        (in_card(lambda card: card["policy"].update(type="memobench_blind")), None),
+    ],
+)
+def test_row_is_marked_by_its_policy(
+    board: Path, tmp_path: Path, change: Callable[[Path], None], marked: bool | None
+) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    change(folder)
+    if marked is not None:  # the inputs of the card are not those of a script
+        check_submission(read_submission(folder))
+    assert page.board_row(read_submission(folder)).supervised is marked
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (of_memory(False, align="contrastive"), "is false on the card of a policy with"),
+        (of_memory(False, memory="keyframes"), "is false on the card of a policy with"),
+        (
+            in_card(lambda card: card["policy"]["settings"].pop("supervised_with_answer")),
+            "found no statement whether",
+        ),
+        (
+            in_card(lambda card: card["policy"]["settings"].pop("align")),
+            "has no align 'None'",
+        ),
+        (
+            in_card(lambda card: card["policy"]["settings"].pop("memory")),
+            "'None'",
+        ),
+    ],
+)
+def test_removed_or_edited_mark_is_refused(
+    board: Path, tmp_path: Path, change: Callable[[Path], None], reason: str
+) -> None:
+    folder = shutil.copytree(board / "one", tmp_path / "one")
+    of_memory()(folder)
+    change(folder)
     with pytest.raises(MemobenchError, match=reason):
         check_submission(read_submission(folder))
 
@@ -282,6 +372,9 @@ def test_submission_of_a_new_user_is_accepted(
     monkeypatch.chdir(tmp_path)
     words = ["submit", str(evaluated), "--name", "mine", "--model", "Mine", "--submitter", "@me"]
     words += ["--training-data", "1,500 demonstrations", "--parameters", "450000000", "--out", "out"]
+    assert main(words) == 2
+    assert "`memobench submit --supervised-with-answer`" in capsys.readouterr().err
+    words.append("--no-supervised-with-answer")
     assert main([*words[:5], "<b>", *words[6:]]) == 2
     assert main([*words[:3], "../mine", *words[4:]]) == 2
     assert main([*words, "--pauses", str(evaluated)]) == 2

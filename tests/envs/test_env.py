@@ -354,7 +354,8 @@ def test_resume_keeps_outcomes_and_other_rows(tmp_path: Path) -> None:
     whole, log = tmp_path / "whole", tmp_path / "log"
     reference = rolled(vector(whole))
     line = {"task": STOVE, "memory_type": "temporal", "episode": 1, "success": True, "checkpoints": []}
-    write_episodes(log, [line, {**line, "task": "another", "episode": 0}])
+    not_run = {**line, "episode": 2, "success": False, "not_run": "no scene"}
+    write_episodes(log, [line, {**line, "task": "another", "episode": 0}, not_run])
     found = rolled(vector(log, resume=True))
     for before, after in zip(reference, found, strict=True):
         np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])

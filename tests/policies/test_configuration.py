@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
@@ -15,10 +16,13 @@ import lerobot_policy_memobench  # noqa: F401  (registers the environment)
 from lerobot_memobench.commands.command_line import recipe_file
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    ALIGN_TARGETS,
+    SUPERVISED,
     MemobenchMemConfig,
     conditions,
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_settings
+from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
 
 OBJECTS = {"size": "small", "perception": "objects"}
 
@@ -65,6 +69,34 @@ def test_recipe_has_the_papers_values(memory: str) -> None:
     assert (policy.size, policy.dtype, policy.ema_decay) == ("pi05", "bfloat16", 0.999)
     assert policy.gradient_checkpointing
     assert policy.memory_settings == ({} if memory == "none" else {"frames": 32, "content": True})
+
+
+# -- the mark of supervision with the answer -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fields", "marked"),
+    [
+        *(({"memory": memory}, memory in ("subgoal", "keyframes")) for memory in (*OURS, "none")),
+        *(({"align": align}, True) for align in ("semantic", "contrastive", "framewise")),
+        *(({"align": "contrastive", "align_targets": name}, name != "progress") for name in ALIGN_TARGETS),
+        ({"align": "contrastive", "text_encoder": "labels"}, True),
+    ],
+)
+def test_policy_that_learns_from_the_answer_is_marked_for_good(
+    fields: dict[str, Any], marked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = config(**fields)
+    assert made.supervised_with_answer is marked
+    made.save_pretrained(tmp_path)
+    later = ["--align=none", "--memory=frames", "--align_targets=subgoals", "--text_encoder=null", "--subgoals=null"]
+    later += ["--memory_settings={}", "--memory_fusion=null"]
+    assert PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=later).supervised_with_answer is marked
+    monkeypatch.setattr(ModelCard, "validate", lambda card: None)  # by the hub
+    policy = MemobenchMemPolicy.__new__(MemobenchMemPolicy)
+    torch.nn.Module.__init__(policy)
+    policy.config = made
+    assert (SUPERVISED in str(policy.generate_model_card("user/data", made.type, None, None))) is marked
 
 
 # -- refusals ------------------------------------------------------------------------------------------------------

@@ -76,6 +76,21 @@ def test_resume_equals_undisturbed_run(fake_loop: FakeLoop, way: str, count: int
     assert (fake_loop.ran, results("out")) == (ALL[count:], before)
 
 
+@pytest.mark.parametrize("way", ["whole", "parts", "jobs"])
+def test_episodes_that_could_not_be_run_are_run_again(fake_loop: FakeLoop, way: str) -> None:
+    assert evaluate("output_dir=undisturbed") == 0
+    fake_loop.unrun = {(STOVE, 1), (DRAWER, 2)}
+    assert set(commands(way, "out")) == {0}
+    assert results("out")[1]["not_run"] == {STOVE: 1, DRAWER: 1}
+    for left in (fake_loop.unrun, {(DRAWER, 2)}, set()):
+        fake_loop.unrun, before = left, fake_loop.unrun
+        fake_loop.ran.clear()
+        assert set(commands(way, "out", "resume=true")) == {0}
+        assert set(fake_loop.ran) == before
+    assert results("out") == results("undisturbed")
+    assert Path("out/episodes.jsonl").read_text().count("\n") == len(ALL)
+
+
 def test_resume_widens_an_evaluation(fake_loop: FakeLoop) -> None:
     assert evaluate("output_dir=out", "resume=true") == 0  # begun in an empty folder
     assert fake_loop.ran == ALL

@@ -22,13 +22,14 @@ from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import STRICT
 from tests.support.logs import card
 
+Json = dict[str, Any]
 TASKS = task_names(suite=STRICT)
-ABOUT = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
+ABOUT: Json = {"model": "One", "submitter": "@one", "date": "2026-11-28", "training_data": "1,500 demonstrations"}
+ABOUT |= {"supervised_with_answer": False}
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
 IMAGES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
 SALT = "5" * 32
-Json = dict[str, Any]
 
 
 # --- a valid evaluation and its submission ---

@@ -35,6 +35,7 @@ class FakeLoop:
         ran: (task, episode) simulated, in order.
         kill_after: the run ends when this number of further episodes is logged.
         changed: fields that records get instead of their usual ones.
+        unrun: (task, episode) that cannot be run.
         before: called with the plan when a call begins.
     """
 
@@ -44,6 +45,7 @@ class FakeLoop:
         self.ran: list[tuple[str, int]] = []
         self.kill_after: int | None = None
         self.changed: dict[str, Any] = {}
+        self.unrun: set[tuple[str, int]] = set()
         self.before: Callable[[EvaluationPlan], object] = lambda plan: None
 
     def __call__(self, plan: EvaluationPlan, cells: Sequence[Cell], card: dict[str, Any], advance: Any) -> None:
@@ -80,6 +82,7 @@ class FakeLoop:
             "failure": None if seed % 2 else "storage_failure" if task.checkpoints else "execution_failure",
             "scene_hash": f"{task.name[:4]}{seed:012d}",
             "wall_s": 1.0,
+            **({"not_run": "no scene"} if (task.name, episode) in self.unrun else {}),
             **self.changed,
         }
 

@@ -14,8 +14,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.board.rules import FEWEST, check_control, check_evaluation
-from lerobot_memobench.constants import EVIDENCE_EPISODES, PROMPT_HORIZON, SCENE_HASH_VERSION
+from lerobot_memobench.board.rules import FEWEST, check_control, check_evaluation, supervised_with_answer
+from lerobot_memobench.board.submission import About
+from lerobot_memobench.constants import EVIDENCE_EPISODES, MEMORY_POLICY, PROMPT_HORIZON, SCENE_HASH_VERSION
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import evidence_line
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
@@ -25,6 +26,9 @@ from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.checkpoint import tree_hash
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
+from lerobot_memobench.rollouts.plan import SCRIPTED
 from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task
 from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
@@ -41,8 +45,8 @@ COPIED, CLOSE = 0.5, 2
 FASTEST = 20
 """Fewest steps to a checkpoint, 1 s; the fastest of 7,764 kept rollouts needed 66."""
 SCENE = re.compile(r"[0-9a-f]{16}")
-SCRIPTS = ("memobench_expert", "memobench_blind")
-"""Policies whose actions the simulator computes."""
+DECISIVE = ("memory", "align", "align_targets")
+"""Settings of `memobench_mem` that decide whether it is supervised with the answer."""
 OBJECTS_READ = "objects"
 """Value of the setting ``perception`` of a policy that reads objects."""
 
@@ -137,6 +141,7 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
     """
     run = submission.evaluation
     check_evaluation(run)
+    _check_mark(run, submission.about)
     _check_log(run)
     for name, control in submission.controls.items():
         check_control(run, control, name)
@@ -261,7 +266,7 @@ def _check_inputs(run: Submitted) -> None:
     reads = settings["perception"] == OBJECTS_READ if "perception" in settings else not _ignores_objects(kind)
     needed = objects if reads and "ENV" in types and detector is None else set()
     asked = _block(run.card.get("settings", {}).get("env"))
-    if kind in SCRIPTS or asked.get("expert_action") or asked.get("blind_action"):
+    if kind in SCRIPTED or asked.get("expert_action") or asked.get("blind_action"):
         needed = {SIMULATOR}
     if claimed - drawn - objects - {SIMULATOR, NO_INPUT} or needed - claimed:
         raise MemobenchError(
@@ -280,6 +285,19 @@ def _ignores_objects(kind: str) -> bool:
 
 def _block(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
+
+
+def _check_mark(run: Submitted, about: About) -> None:
+    """Check that the mark of supervision with the answer is there, and agrees with the alignment and the memory."""
+    marked, policy = supervised_with_answer(run, about), run.card[POLICY]
+    decisive: Any = {name: str(_block(policy.get("settings")).get(name)) for name in DECISIVE}
+    if policy.get("type") != MEMORY_POLICY or decisive["memory"] not in (NONE, *OURS, str(None)):  # or of a plugin
+        return
+    if MemobenchMemConfig(device="cpu", **decisive).supervised_with_answer and not marked:
+        raise MemobenchError(
+            f"{run.folder}: supervised_with_answer is false on the card of a policy with {decisive}; submit the card "
+            "unchanged"
+        )
 
 
 def _check_policy(run: Submitted) -> None:

@@ -13,7 +13,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from lerobot_memobench.board.rules import SEEDS
+from lerobot_memobench.board.rules import SEEDS, supervised_with_answer
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.envs.evaluation_file import INPUTS, POLICY
 from lerobot_memobench.evaluation.comparison import compare_evaluations
@@ -41,6 +41,7 @@ class BoardRow:
         without_memory: SR of the partner without a memory.
         replan: executed actions of each plan.
         memory_stride: control steps between updates of the memory, where the policy's settings name them.
+        supervised: whether the policy was supervised with the answer; None for a script.
     """
 
     name: str
@@ -58,6 +59,7 @@ class BoardRow:
     without_memory: Rate | None
     replan: int | None
     memory_stride: int | None
+    supervised: bool | None
 
 
 def board_rows(board: Path) -> list[BoardRow]:
@@ -95,6 +97,7 @@ def board_row(
         without_memory=None if partner is None else partner.evaluation.summary.average["SR"],
         replan=evaluation.replan_steps,
         memory_stride=memory_stride(evaluation.card[POLICY].get("settings", {})),
+        supervised=supervised_with_answer(evaluation, submission.about),
     )
 
 
@@ -120,6 +123,7 @@ HEAD = (
         "follows evidence",
         "change by pauses",
         "without memory, SR",
+        "supervised with the answer",
         "suite",
         "assets",
     ),
@@ -130,6 +134,7 @@ UNRANKED = 1000
 
 Cell = tuple[str, float | str]
 """HTML of a cell, and the value by which it is sorted."""
+SUPERVISED: Mapping[bool | None, Cell] = {True: ("yes", 1), False: ("no", 0), None: (NOT_APPLICABLE, -1)}
 
 
 def table() -> str:
@@ -154,6 +159,7 @@ def _line(rank: int | None, row: BoardRow) -> str:
         _evidence(row.evidence),
         _pauses(row.pauses),
         _rate(row.without_memory),
+        SUPERVISED[row.supervised],
         *((escape(text), text) for text in (row.suite, row.assets, row.inputs)),
         _interval(row.replan, row.memory_stride),
         (NOT_APPLICABLE if count is None else f"{count:,}", -1 if count is None else count),

@@ -1,4 +1,4 @@
-"""Rules of the board that an honest evaluation may break: settings, extent, versions, control, sealed seeds.
+"""Rules of the board that an honest evaluation may break: settings, extent, versions, control, sealed seeds, mark.
 
 `check_evaluation` and `check_control` need the evaluation's own files only.
 """
@@ -13,14 +13,15 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.version import InvalidVersion
 
-from lerobot_memobench.board.submission import PAUSES
-from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, PAPER, SEALED, SPLITS
+from lerobot_memobench.board.submission import PAUSES, About
+from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, MEMORY_POLICY, PAPER, SEALED, SPLITS
 from lerobot_memobench.datasets.generate import task_hash
-from lerobot_memobench.envs.evaluation_file import POLICY, differences
+from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
 from lerobot_memobench.envs.settings import EnvSettings
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.records import Run
 from lerobot_memobench.rollouts.card import PACKAGES
+from lerobot_memobench.rollouts.plan import SCRIPTED
 from lerobot_memobench.tasks.catalogue import get_task, task_names
 from lerobot_memobench.tasks.task import PUBLISHED, STRICT
 
@@ -29,10 +30,13 @@ FEWEST, MOST = 10, EVALUATION_EPISODES
 SEEDS = {SPLITS[name].start: name for name in (PAPER, SEALED)}
 """Seed of the first episode -> split of seeds that count."""
 MAY_DIFFER = {
-    *("suite", "seed_base", "obs_type", "referent", "demonstration_prompt", "prompt_in", "replan_steps"),
-    *("evidence", "salt"),
-}
+    *("suite", "seed_base", "obs_type", "convention", "referent", "demonstration_prompt", "replan_steps", "evidence"),
+    *OF_ONE_EVALUATION,
+} - {INPUTS}
 """Settings of the protocol that a submission may choose; all others have their defaults."""
+LONGEST_PLAN = 200
+"""Largest number of steps of input window, delay and executed plan together. With longer ones the holds of strict tasks
+have more equal lengths, from which a policy with a clock profits."""
 CONTROL_SETTING: Mapping[str, Mapping[str, Any]] = {PAUSES: {"pause_steps": 100}}
 REQUIRED = {
     each.name: each.specifier for each in map(Requirement, metadata.requires(PACKAGES[0]) or ()) if not each.marker
@@ -54,6 +58,26 @@ def check_evaluation(run: Run, *, part: bool = False, control: str = "") -> None
             f"{run.folder} has the salt {run.protocol['salt']}; expected a salt with the sealed seeds, and none with "
             "others: evaluate them by `memobench test-sealed`"
         )
+
+
+def supervised_with_answer(run: Run, about: About) -> bool | None:
+    """Return whether texts that name the hidden answer supervised a policy in training, None for a script.
+
+    The configuration of `memobench_mem` on the card holds it; for another policy, the submitter states it.
+    """
+    policy = run.card[POLICY]
+    if policy.get("type") in SCRIPTED:
+        return None
+    marked = policy.get("settings", {}).get("supervised_with_answer")
+    if marked is None and policy.get("type") != MEMORY_POLICY:
+        marked = about.supervised_with_answer
+    if not isinstance(marked, bool):
+        raise MemobenchError(
+            f"{run.folder}: found no statement whether the policy was supervised with the answer; expected the setting "
+            f"supervised_with_answer of {MEMORY_POLICY} on the card, as this version writes it, and of another policy "
+            "`memobench submit --supervised-with-answer` or `--no-supervised-with-answer`"
+        )
+    return marked
 
 
 def check_control(run: Run, control: Run, name: str, *, part: bool = False) -> None:
@@ -86,6 +110,12 @@ def _check_settings(run: Run, **control: Any) -> None:
         )
     if unlike := differences(protocol, fixed, ignore=MAY_DIFFER):
         raise MemobenchError(f"{run.folder}: {unlike[0]} on the board; evaluate with the value of the board")
+    plan = protocol["window_steps"] + protocol["delay_steps"] + (protocol["replan_steps"] or 1)
+    if plan > LONGEST_PLAN:
+        raise MemobenchError(
+            f"{run.folder}: window_steps, delay_steps and replan_steps are {plan} together; expected at most "
+            f"{LONGEST_PLAN}: execute fewer actions of each plan"
+        )
 
 
 def _check_extent(run: Run, names: Sequence[str], fewest: int) -> None:

@@ -100,6 +100,8 @@ class About(BaseModel):
         training_data: origin and size of the demonstrations.
         parameters: number of parameters; None if unknown, 0 for a scripted policy.
         without_memory: row of the board with a policy of the same kind that has no memory.
+        supervised_with_answer: whether texts that name the hidden answer supervised the policy in training, see
+            `rules.supervised_with_answer`.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -111,6 +113,7 @@ class About(BaseModel):
     parameters: Annotated[int, Ge(0), Le(10**13)] | None = None
     links: dict[Literal["code", "weights", "paper"], Annotated[str, AfterValidator(_link)]] = {}
     without_memory: RowName | None = None
+    supervised_with_answer: bool | None = None
 
 
 # --- files ---

@@ -166,6 +166,10 @@ def submit(
     without_memory: Annotated[
         str | None, typer.Option(help="Row of the board with a partner that has no memory.", metavar="NAME")
     ] = None,
+    supervised_with_answer: Annotated[
+        bool | None,
+        typer.Option(help="Whether texts that name the hidden answer were learned from; memobench_mem records it."),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the submission and the text of the pull request.")] = Path(
         "outputs/board"
     ),
@@ -174,7 +178,7 @@ def submit(
 
     It consists of a folder for results/board and the text of a pull request.
     """
-    from lerobot_memobench.board.rules import check_control, check_evaluation
+    from lerobot_memobench.board import rules
     from lerobot_memobench.board.submission import (
         BOARD,
         LINKS,
@@ -197,16 +201,18 @@ def submit(
         {
             **{"model": model, "submitter": submitter, "date": f"{dt.date.today()}", "training_data": training_data},
             **{"parameters": parameters, "without_memory": without_memory},
+            "supervised_with_answer": supervised_with_answer,
             "links": {key: link for key, link in links.items() if link is not None},
         },
         About,
     )
     evaluation = own_evaluation(card)
-    check_evaluation(evaluation, part=check)
+    rules.check_evaluation(evaluation, part=check)
     if pauses:
-        check_control(evaluation, own_evaluation(pauses), PAUSES, part=check)
+        rules.check_control(evaluation, own_evaluation(pauses), PAUSES, part=check)
     if check:
         return say(f"accepted: {count_of(len(evaluation.records), 'rollout')} of {card}; nothing is written")
+    rules.supervised_with_answer(evaluation, about)
     write_submission(out / name, about, {"": card, **({PAUSES: pauses} if pauses else {})})
     say(f"accepted: {out / name}")
     say(f"text of the pull request: {write_file(out / f'{name}.md', pull_request(name, about, evaluation))}")

@@ -32,7 +32,7 @@ from lerobot_memobench.conformance.streams import (
     task_of_texts,
     write_streams,
 )
-from lerobot_memobench.constants import CLOCK
+from lerobot_memobench.constants import CLOCK, MEMORY_POLICY
 from lerobot_memobench.datasets.frames import read_frame_table
 from lerobot_memobench.datasets.layout import OBJECTS as OBJECTS_COLUMN
 from lerobot_memobench.datasets.layout import objects_column
@@ -43,7 +43,7 @@ from lerobot_memobench.policies.checkpoint import check_device, check_weights, q
 from lerobot_memobench.policies.compatibility import chosen_convention, trained_convention
 from lerobot_memobench.rollouts.rollout import ActionQueue
 from lerobot_memobench.sim.convention import UPRIGHT, convention_of
-from lerobot_memobench.training.command import MEMORY_POLICY, take_training_options
+from lerobot_memobench.training.command import take_training_options
 
 REPLAN = 3  # default actions per chunk, so that a short stream has several chunks
 STREAMS = 3  # number of episodes: a row, and two others in its batch

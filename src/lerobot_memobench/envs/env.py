@@ -388,7 +388,7 @@ class SkipLogged(gym.Wrapper[Any, Any, Any, Any]):
     def _successes(self) -> dict[int, bool]:
         # Read at the first reset: each process of a vector environment opens its own.
         lines, name = read_lines(self._log_dir) if has_log(self._log_dir) else [], self.get_wrapper_attr("task")
-        return {line["episode"]: line["success"] for line in lines if line["task"] == name}
+        return {line["episode"]: line["success"] for line in lines if line["task"] == name and "not_run" not in line}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start the episode of a seed, or skip it."""

@@ -204,7 +204,8 @@ def _ends_torn(file: Any) -> bool:
 def write_episodes(directory: str | Path, records: Iterable[Mapping[str, Any]]) -> Path:
     """Add the missing lines of ``records`` to ``<directory>/episodes.jsonl`` atomically and return its path.
 
-    Existing lines stay unchanged, including unreadable ones. Readers use the last line of an episode.
+    Existing lines stay unchanged, including unreadable ones, but for those of episodes that were not run and now are.
+    Readers use the last line of an episode.
     """
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -212,6 +213,9 @@ def write_episodes(directory: str | Path, records: Iterable[Mapping[str, Any]]) 
     new = [line for line in map(line_of, records) if logged.get(key_of(line)) != line]
     if new or not path.is_file():
         content = path.read_bytes() if path.is_file() else b""
+        retried = [line for line in map(logged.get, map(key_of, new)) if line is not None and "not_run" in line]
+        stale = {log_text([line]).encode() for line in retried}
+        content = b"".join(line for line in content.splitlines(keepends=True) if line not in stale)
         torn = b"\n" if content and not content.endswith(b"\n") else b""
         write_file(path, content + torn + log_text(new).encode())
     return path

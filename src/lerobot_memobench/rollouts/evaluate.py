@@ -181,8 +181,8 @@ def resumed_card(folder: Path, card: dict[str, Any], note: Note) -> dict[str, An
 
 
 def logged(folder: Path) -> set[Key]:
-    """Return the episodes in a folder's log, with those that could not be run."""
-    return {*map(key_of, read_lines(folder))} if has_log(folder) else set()
+    """Return the episodes in a folder's log, without those that could not be run: a resumed evaluation retries them."""
+    return {key_of(line) for line in read_lines(folder) if "not_run" not in line} if has_log(folder) else set()
 
 
 # --- the folder of an evaluation ---

@@ -199,14 +199,17 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
-    """Return the episodes of all parts, sorted, each once; raise where two parts disagree about one."""
+    """Return the episodes of all parts, sorted, each once; raise where two parts disagree about one.
+
+    An episode that could not be run in one part, and was run in another, is the one that was run.
+    """
     episodes: dict[Key, tuple[Path, Mapping[str, Any]]] = {}
-    for folder, records in parts.items():
-        for record in records:
-            known = episodes.setdefault(key_of(record), (folder, record))
-            problem = disagreement(known[1], record, f"in {known[0]}", f"in {folder}")
-            if problem is not None:
-                raise MemobenchError(f"{problem}; leave the wrong folder out")
+    lines = [(folder, record) for folder, records in parts.items() for record in records]
+    for folder, record in sorted(lines, key=lambda line: "not_run" in line[1]):
+        known = episodes.setdefault(key_of(record), (folder, record))
+        problem = disagreement(known[1], record, f"in {known[0]}", f"in {folder}")
+        if problem is not None and "not_run" not in record:
+            raise MemobenchError(f"{problem}; leave the wrong folder out")
     return [dict(episodes[key][1]) for key in sorted(episodes)]
 
 

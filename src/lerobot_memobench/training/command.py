@@ -27,6 +27,7 @@ from lerobot_memobench.commands.command_line import (
     value_of,
     without,
 )
+from lerobot_memobench.constants import MEMORY_POLICY
 from lerobot_memobench.datasets.episodes import naming_damage, read_info
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, INFO_FILE
 from lerobot_memobench.envs.observations import check_obs_type
@@ -60,7 +61,6 @@ from lerobot_memobench.untrusted import check_fetched
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
 
-MEMORY_POLICY = "memobench_mem"
 OBJECT_BATCH = 72
 """Default frames per update of a policy whose samples are in main memory: a dozen episodes, six frames of each."""
 SHORT_TRAINING = 2000

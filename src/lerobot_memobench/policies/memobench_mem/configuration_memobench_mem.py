@@ -40,6 +40,7 @@ logger = logging.getLogger(__name__)
 OBJECTIVES = (FLOW_MATCHING, REGRESSION)
 ALIGN_WEIGHTS: Mapping[str, float] = {"none": 0.0, "semantic": 0.1, "contrastive": 0.1, "framewise": 0.05}
 SUBGOALS, SHUFFLED, PROGRESS, ANSWERS = ALIGN_TARGETS = ("subgoals", "shuffled", "progress", "answers")
+SUPERVISED = "Supervised with the answer: the texts of its training name the hidden answer"
 MODULATION, CONTEXT, OWN = "modulation", "context", "own"
 MEMORY_FUSIONS = (MODULATION, CONTEXT, OWN)
 PERCEPTIONS = ("pixels", "objects")
@@ -212,6 +213,10 @@ class MemobenchMemConfig(PreTrainedConfig):
     text_encoder: str | None = policy_setting(None, used_if=ALIGNMENT)
     """Encoder of subgoal texts: ``words`` (hashed words), ``labels`` (a random vector per text), or the folder or
     repository of a SigLIP model; None: the default of the size."""
+    supervised_with_answer: bool = False
+    """Mark of a policy that learned from texts which name the hidden answer: by an alignment, except with
+    ``align_targets=progress``, or by a memory that learns from texts. Construction sets it, and a training that starts
+    from such a checkpoint keeps it."""
 
     # -- memory
     memory: str = "frames"
@@ -293,6 +298,7 @@ class MemobenchMemConfig(PreTrainedConfig):
         self._check_numbers()
         super().__post_init__()
         self._check_alignment()
+        self.supervised_with_answer |= self.privileged_memory or (self.align != NONE and self.align_targets != PROGRESS)
 
     def _defaults(self) -> dict[str, Any]:
         """Return the defaults that depend on the size, the perception and the memory."""

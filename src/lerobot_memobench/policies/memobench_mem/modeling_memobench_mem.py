@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.common.vla_utils import pad_vector
 from lerobot.policies.pretrained import PreTrainedPolicy
@@ -36,7 +37,11 @@ from lerobot_memobench.policies.memobench_mem.checkpoints import (
     require_agreement,
     weights_file,
 )
-from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import ALIGN_WEIGHTS, MemobenchMemConfig
+from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
+    ALIGN_WEIGHTS,
+    SUPERVISED,
+    MemobenchMemConfig,
+)
 from lerobot_memobench.policies.memobench_mem.encoders import ENCODED, ObservationEncoder, VisualTokenEncoder
 from lerobot_memobench.policies.memobench_mem.losses import (
     alignment_loss,
@@ -484,6 +489,13 @@ class MemobenchMemPolicy(PreTrainedPolicy):
         policy.to(config.device)
         policy.eval()
         return policy
+
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
+        """Return LeRobot's model card, with the mark of a policy that learned from the hidden answer."""
+        card = super().generate_model_card(*args, **kwargs)
+        if self.config.supervised_with_answer:
+            card.text = f"\n**{SUPERVISED}.**\n{card.text}"
+        return card
 
     # -- adapters --------------------------------------------------------------------------------------------------
 
