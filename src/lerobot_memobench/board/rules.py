@@ -68,9 +68,9 @@ def supervised_with_answer(run: Run, about: About) -> bool | None:
     policy = run.card[POLICY]
     if policy.get("type") in SCRIPTED:
         return None
-    marked = policy.get("settings", {}).get("supervised_with_answer")
-    if marked is None and policy.get("type") != MEMORY_POLICY:
-        marked = about.supervised_with_answer
+    marked = about.supervised_with_answer
+    if policy.get("type") == MEMORY_POLICY:
+        marked = policy.get("settings", {}).get("supervised_with_answer")
     if not isinstance(marked, bool):
         raise MemobenchError(
             f"{run.folder}: found no statement whether the policy was supervised with the answer; expected the setting "
