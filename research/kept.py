@@ -22,7 +22,7 @@ from lerobot_memobench.io import draft_of, write_file
 
 ROLLOUTS, EVALUATIONS = "rollouts.parquet", "evaluations.parquet"
 NAME, FIELDS, CARD, COMMAND = "evaluation", "fields", "card", "command"
-SOMETIMES = ("fault", "not_run")
+SOMETIMES = ("fault", "not_run", "settled")
 """Fields that only some lines of a log have."""
 
 Rows = list[dict[str, Any]]

@@ -188,7 +188,8 @@ ONE = "[`one`](rollouts.parquet)"
 )
 def test_a_figure_that_differs_from_its_source_is_found(tmp_path: Path, row: str, problem: str | None) -> None:
     task = "turn_on_the_stove_and_turn_it_off"
-    keep_one(tmp_path, [rollout(task, "temporal", "S", [k > 0], k > 0, k) for k in range(4)])
+    lines = [rollout(task, "temporal", "S", [k > 0], k > 0, k) for k in range(4)]
+    keep_one(tmp_path, [lines[0] | {"settled": False}, *lines[1:]])
     runs = ["run"] * 100 + ["short"] * 100
     table = pa.table({"run": runs, "solved": [True] * 199 + [False]})
     pq.write_table(table, tmp_path / "demonstrations.parquet")
