@@ -1,6 +1,7 @@
-"""A small Hugging Face hub: what huggingface_hub, datasets and LeRobot ask of one to write, load and stream a dataset.
+"""A small Hugging Face hub: what huggingface_hub, datasets and LeRobot ask of one to write, load and stream files.
 
-In memory, for one repository per name, with commits, tags, LFS and byte ranges. Writing needs the token ``TOKEN``.
+In memory, for one repository per name (dataset, model or space), with commits, tags, LFS and byte ranges. Writing needs
+the token ``TOKEN``.
 """
 
 from __future__ import annotations
@@ -27,10 +28,15 @@ class Hub(ThreadingHTTPServer):
     def clear(self) -> None:
         """Forget all that was written and asked."""
         self.repos: dict[str, dict[str, bytes]] = {}
+        self.kinds: dict[str, str] = {}
         self.large: dict[str, set[str]] = {}
         self.tags: dict[str, dict[str, str]] = {}
         self.blobs: dict[str, bytes] = {}
         self.requests: list[str] = []
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+        self.server_close()
 
     @property
     def address(self) -> str:
@@ -58,10 +64,11 @@ class Handler(BaseHTTPRequestHandler):
         for pattern, handler in ROUTES:
             found = re.fullmatch(pattern, f"{self.command} {path}")
             if found:
-                repo = found.groupdict().get("repo")
-                if repo is not None and repo not in self.server.repos:
+                words = found.groupdict()
+                repo, kind = words.get("repo"), (words.pop("kind", None) or MODELS).strip("/")
+                if repo is not None and (repo not in self.server.repos or kind != self.server.kinds.get(repo, kind)):
                     return self.answer(404, {"error": "no such repository"}, {"X-Error-Code": "RepoNotFound"})
-                return handler(self, body, **found.groupdict())
+                return handler(self, body, **words)
         return self.answer(404, {"error": f"{self.command} {path} is not known"})
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = handle_one
@@ -80,18 +87,20 @@ class Handler(BaseHTTPRequestHandler):
 
     def create(self, body: bytes) -> None:
         asked = json.loads(body)
-        repo = f"{asked.get('organization') or 'somebody'}/{asked['name']}"
+        repo, kind = f"{asked.get('organization') or 'somebody'}/{asked['name']}", f"{asked.get('type') or 'model'}s"
+        url = {"url": f"{self.server.address}/{'' if kind == MODELS else kind + '/'}{repo}"}
         if repo in self.server.repos:
-            return self.answer(409, {"url": f"{self.server.address}/datasets/{repo}"})
+            return self.answer(409, url)
         self.server.repos[repo], self.server.large[repo], self.server.tags[repo] = {}, set(), {}
-        return self.answer(200, {"url": f"{self.server.address}/datasets/{repo}"})
+        self.server.kinds[repo] = kind
+        return self.answer(200, url)
 
     def validate_yaml(self, body: bytes) -> None:
         self.answer(200, {"errors": [], "warnings": []})
 
     def preupload(self, body: bytes, repo: str, revision: str) -> None:
         def mode(name: str) -> str:
-            return "lfs" if name.endswith((".parquet", ".mp4", ".hdf5")) else "regular"
+            return "lfs" if name.endswith((".parquet", ".mp4", ".hdf5", ".safetensors")) else "regular"
 
         asked = json.loads(body)
         ignored = tuple(line.strip("/") + "/" for line in asked.get("gitIgnore", "").split())  # of folders at the top
@@ -214,19 +223,23 @@ class Handler(BaseHTTPRequestHandler):
 
 REPO = r"(?P<repo>[^/]+/[^/]+)"
 REVISION = r"(?P<revision>[^/]+)"
+MODELS = "models"
+KIND = r"(?P<kind>datasets|models|spaces)"
+PLACE = r"(?P<kind>datasets/|spaces/|)"
+"""Before a repository's name in addresses of its files; a model has none."""
 ROUTES = [
     (r"POST /api/repos/create", Handler.create),
     (r"POST /api/validate-yaml", Handler.validate_yaml),
-    (rf"POST /api/datasets/{REPO}/preupload/{REVISION}", Handler.preupload),
-    (rf"POST /datasets/{REPO}\.git/info/lfs/objects/batch", Handler.batch),
+    (rf"POST /api/{KIND}/{REPO}/preupload/{REVISION}", Handler.preupload),
+    (rf"POST /{PLACE}{REPO}\.git/info/lfs/objects/batch", Handler.batch),
     (r"PUT /lfs/(?P<oid>\w+)", Handler.put_blob),
-    (rf"POST /api/datasets/{REPO}/commit/{REVISION}", Handler.commit),
-    (rf"POST /api/datasets/{REPO}/tag/{REVISION}", Handler.add_tag),
-    (rf"DELETE /api/datasets/{REPO}/tag/{REVISION}", Handler.delete_tag),
-    (rf"GET /api/datasets/{REPO}/refs", Handler.refs),
-    (rf"GET /api/datasets/{REPO}", Handler.info),
-    (rf"GET /api/datasets/{REPO}/revision/{REVISION}", Handler.info),
-    (rf"GET /api/datasets/{REPO}/tree/{REVISION}(/(?P<path>.*))?", Handler.tree),
-    (rf"POST /api/datasets/{REPO}/paths-info/{REVISION}", Handler.paths_info),
-    (rf"(GET|HEAD) /(datasets/)?{REPO}/resolve/{REVISION}/(?P<path>.*)", Handler.resolve),
+    (rf"POST /api/{KIND}/{REPO}/commit/{REVISION}", Handler.commit),
+    (rf"POST /api/{KIND}/{REPO}/tag/{REVISION}", Handler.add_tag),
+    (rf"DELETE /api/{KIND}/{REPO}/tag/{REVISION}", Handler.delete_tag),
+    (rf"GET /api/{KIND}/{REPO}/refs", Handler.refs),
+    (rf"GET /api/{KIND}/{REPO}", Handler.info),
+    (rf"GET /api/{KIND}/{REPO}/revision/{REVISION}", Handler.info),
+    (rf"GET /api/{KIND}/{REPO}/tree/{REVISION}(/(?P<path>.*))?", Handler.tree),
+    (rf"POST /api/{KIND}/{REPO}/paths-info/{REVISION}", Handler.paths_info),
+    (rf"(GET|HEAD) /{PLACE}{REPO}/resolve/{REVISION}/(?P<path>.*)", Handler.resolve),
 ]
