@@ -83,11 +83,11 @@ lerobot eval env=memobench suite=strict evidence=true {door} output_dir=outputs/
 lerobot eval env=memobench suite=strict evidence=true pause_steps=100 {door} output_dir=outputs/eval/{slug}_pauses
 ```
 
-With your own numbers and address:
+With your own numbers and address; `--supervised-with-answer` if texts that name the hidden answer were learned from:
 
 ```bash
 memobench submit outputs/eval/{slug} --name {slug} --model {name} --submitter @you --parameters 4000000000 \\
-    --training-data "1,500 strict demonstrations" --pauses outputs/eval/{slug}_pauses
+    --training-data "1,500 strict demonstrations" --no-supervised-with-answer --pauses outputs/eval/{slug}_pauses
 ```
 """
 CONTROL = """
