@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import subprocess
 import zipfile
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_memobench.policies.checkpoint import checkpoint_files, shipped_policies
+from lerobot_memobench.rollouts.plan import plan_line
 from scripts.invitations import GUESTS, Guest, invitation
 from tests.support.hub_server import Hub
 from tests.support.index_server import Index
@@ -60,9 +62,12 @@ def test_commands_of_the_invitations_are_valid(guest: Guest, tmp_path: Path) -> 
     page = tmp_path / "invitation.md"
     page.write_text(invitation(guest, "somebody", "lerobot_policy_memobench==0.2.0"))
     typed = [*commands(page)]
-    assert len(typed) == 7 + guest.on_libero
+    evaluations = [words[2:] for words in typed if words[:2] == ["lerobot", "eval"]]
+    assert (len(typed), len(evaluations)) == (7 + guest.on_libero, 3 + guest.on_libero)
     for words in typed:
         check(words)
+    for line in evaluations:  # with the checks before a simulation: of dialect, images, variants, pauses
+        assert plan_line(line).policy.label == guest.slug
 
 
 # --- refusals ---
@@ -158,6 +163,12 @@ def test_another_wheel_of_a_version_is_refused(
 @pytest.mark.timeout(6000)
 def test_wheel_is_installed_by_name_and_evaluates(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """In an empty environment: the expert, and the shipped policy from the local hub."""
+    environment = publish.programs()
+    reached = ["python", "-m", "pip", "download", "-q", "--no-deps", "-d"]
+    if shutil.which("uv", path=environment["PATH"]) is None:
+        pytest.skip("uv is neither in .uv nor on the PATH")
+    if subprocess.run([*reached, str(tmp_path), "termcolor"], env=environment).returncode:
+        pytest.skip("pip cannot reach a package index")
     publish.main(["--only", "weights", "wheel", "install", "--out", str(tmp_path), "--user", "somebody"])
     printed = capfd.readouterr().out
     assert "policy=memobench_expert" in printed
