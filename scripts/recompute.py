@@ -29,7 +29,7 @@ from lerobot_memobench.evaluation.evidence import Evidence  # noqa: E402
 from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, mean_row, percent  # noqa: E402
 from lerobot_memobench.evaluation.records import read_runs  # noqa: E402
 from lerobot_memobench.evaluation.report import write_report  # noqa: E402
-from lerobot_memobench.tasks.catalogue import get_task  # noqa: E402
+from lerobot_memobench.tasks.catalogue import get_task, task_number  # noqa: E402
 from lerobot_memobench.tasks.task import MEMORY_TYPES  # noqa: E402
 from research.kept import ROLLOUTS as ROLLOUT_TABLE  # noqa: E402
 from research.kept import keep, restore  # noqa: E402
@@ -42,6 +42,8 @@ NOT_KEPT = "log not kept"
 ROLLOUTS = "rollouts"
 FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
 """Columns of an evaluation by evidence."""
+NUMBERS = tuple(map(str, range(1, 31)))
+"""Columns of SR by the number of a task."""
 INTERVAL = re.compile(r"[\d.]+\s\[[\d.]+–[\d.]+\]")
 
 Values = Mapping[str, str]
@@ -91,6 +93,7 @@ def of_evaluation(folder: Path) -> Values:
         **(of_evidence(evidence) if evidence else {}),
         **{metric: in_words(summary.average[metric]) for metric in PAPER_METRICS},
         **{name: f"{percent(row['SR'].value):.1f}" for name, row in summary.memory_types.items()},
+        **{str(task_number(name)): f"{percent(task.rates['SR'].value):.1f}" for name, task in summary.tasks.items()},
         ROLLOUTS: f"{summary.rollouts:,}",
     }
 
@@ -167,12 +170,13 @@ def source_of(page: Path, cell: str) -> Values | None:
 def rows_of(page: Path) -> Iterator[tuple[list[str], Values, str]]:
     """Yield each row of results of a page, its cells under known headings, and the cell that names its source.
 
-    A row of results is one with an interval, or of a table of SR or of memory types.
+    A row of results is one with an interval, or of a table of SR, of memory types or of numbers of tasks.
     """
     for head, rows in tables(page):
-        known = [name for name in head if name in (*PAPER_METRICS, *MEMORY_TYPES, ROLLOUTS, FOLLOWS, CHANCE, SCENES)]
+        columns = (*PAPER_METRICS, *MEMORY_TYPES, *NUMBERS, ROLLOUTS, FOLLOWS, CHANCE, SCENES)
+        known = [name for name in head if name in columns]
         for row in rows:
-            if {"SR", "temporal"} & set(known) or any(map(INTERVAL.search, row)):
+            if {"SR", *MEMORY_TYPES, *NUMBERS} & set(known) or any(map(INTERVAL.search, row)):
                 cells = {name: row[head.index(name)] for name in known}
                 yield row, {name: cell for name, cell in cells.items() if cell}, row[-1]
 
@@ -240,7 +244,8 @@ def keep_evaluation(folder: Path, name: str) -> str:
     row = of_kept(EVALUATIONS, name)
     if row != of_evaluation(folder):
         raise MemobenchError(f"{EVALUATIONS} gives other figures for {name!r} than {folder}; this is a bug")
-    return f"| {' | '.join(row.values())} | [`{name}`](../../results/evaluations/{ROLLOUT_TABLE}) |"
+    cells = " | ".join(cell for column, cell in row.items() if column not in NUMBERS)
+    return f"| {cells} | [`{name}`](../../results/evaluations/{ROLLOUT_TABLE}) |"
 
 
 def main(words: list[str]) -> int:
