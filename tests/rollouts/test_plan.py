@@ -104,12 +104,14 @@ def test_settings_are_typed_and_completed(
     assert (facts(again), again.grid, again.options.shard) == (facts(plan), plan.grid, plan.options.shard)
 
 
+CHECKPOINT = shipped_policies()["memobench_strict"]
 BAD: list[tuple[list[str], str]] = [
     (["episodes=many"], "a whole number"),
     (["episodes=0"], "episodes=0"),
     (["batch_size=-1"], "batch_size=-1"),
     (["policy=diffusion", "policy.down_dims=[1"], "policy.down_dims=[1 cannot be read"),
     (["resume=true"], "output_dir="),
+    ([f"policy={CHECKPOINT}", f"output_dir={CHECKPOINT}"], "is also the policy; name another folder"),
     (["env.fps=30"], "fps"),
     (["env.render_every=5"], "render_every"),
     (["suite=strict", f"tasks={STOVE}"], "task of the published suite"),

@@ -383,6 +383,9 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
 def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:
     """Return the folder of the evaluation or of its part; by default a new dated folder."""
     if settings.output_dir is not None:
+        checkpoint = settings.policy.get("path")
+        if checkpoint is not None and Path(settings.output_dir).resolve() == Path(checkpoint).resolve():
+            raise MemobenchError(f"output_dir={settings.output_dir} is also the policy; name another folder")
         return Path(settings.output_dir) / (options.shard.folder if options.shard is not None else "")
     base = Path("outputs/eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}_memobench_{policy.type}"
     numbered = (base.with_name(f"{base.name}_{k}") for k in itertools.count(2))
