@@ -3,8 +3,8 @@
 ``python scripts/recompute.py`` checks README, ``docs/benchmark/results.md`` and ``results/demonstrations.md``. The
 last cell of a table's row names the source of its values: an evaluation in ``results/*/rollouts.parquet``, a run in
 ``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
-not kept*. Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be
-there.
+not kept*. Rows of ``results/study.md`` are rows of the tables that ``research.memory_study`` makes of the kept cells.
+Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be there.
 
 ``python scripts/recompute.py keep FOLDER NAME`` adds an evaluation to ``results/evaluations`` and prints its row.
 ``python scripts/recompute.py restore TABLES NAME FOLDER`` writes a kept evaluation as a folder that commands read.
@@ -33,11 +33,14 @@ from lerobot_memobench.tasks.catalogue import get_task, task_number  # noqa: E40
 from lerobot_memobench.tasks.task import MEMORY_TYPES  # noqa: E402
 from research.kept import ROLLOUTS as ROLLOUT_TABLE  # noqa: E402
 from research.kept import keep, restore  # noqa: E402
+from research.memory_study.grid import GRID_FILE, read_grid  # noqa: E402
+from research.memory_study.tables import tables as study_tables  # noqa: E402
 
 RESULTS = ROOT / "results"
 EVALUATIONS = RESULTS / "evaluations"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmark" / "results.md", RESULTS / "demonstrations.md")
 CLAIMS = RESULTS / "figures.md"
+STUDY = RESULTS / "study.md"
 NOT_KEPT = "log not kept"
 ROLLOUTS = "rollouts"
 FOLLOWS, CHANCE, SCENES = "follows", "chance", "scenes"
@@ -147,8 +150,13 @@ def of_kept(kept: Path, name: str) -> Values:
 
 def tables(page: Path) -> Tables:
     """Return the tables of a page."""
+    return tables_in(page.read_text())
+
+
+def tables_in(text: str) -> Tables:
+    """Return the tables of a text in Markdown."""
     found = []
-    for block in re.findall(r"(?:^\|.*\n)+", page.read_text(), re.MULTILINE):
+    for block in re.findall(r"(?:^\|.*\n)+", f"{text}\n", re.MULTILINE):
         head, _, *rows = ([cell.strip() for cell in line.strip().strip("|").split("|")] for line in block.splitlines())
         found.append((head, rows))
     return found
@@ -192,6 +200,22 @@ def problems_of_tables(page: Path) -> list[str]:
             if values is not None and cell != values.get(name):
                 found.append(f"{page.name}: {row[0]} has {name} {cell}, and {values.get(name)} by its source")
     return found
+
+
+def problems_of_study(page: Path = STUDY, kept: Path = EVALUATIONS) -> list[str]:
+    """Return the rows of the study's tables that no table of its program has with the same cells."""
+    made: Tables = []
+    with tempfile.TemporaryDirectory() as folder:
+        restore(kept, Path(folder))
+        for grid in map(read_grid, GRID_FILE.parent.glob("*.yaml")):
+            made += [table for suite in grid.suites for table in tables_in(study_tables(grid, Path(folder), suite))]
+    known = [dict(zip(head, row, strict=True)) for head, rows in made for row in rows]
+    return [
+        f"{page.name}: {' | '.join(row)} is in no table of research.memory_study"
+        for head, rows in tables(page)
+        for row in rows
+        if not any(dict(zip(head, row, strict=True)).items() <= each.items() for each in known)
+    ]
 
 
 def problems_of_prose(page: Path, claims: Path = CLAIMS) -> list[str]:
@@ -265,7 +289,8 @@ def main(words: list[str]) -> int:
             print(__doc__, file=sys.stderr)
             return 2
     checks = (problems_of_tables, problems_of_prose)
-    problems = [*(problem for page in PAGES for check in checks for problem in check(page)), *problems_of_claims()]
+    problems = [problem for page in PAGES for check in checks for problem in check(page)]
+    problems += [*problems_of_study(), *problems_of_claims()]
     for page in PAGES:
         for row, _, source in rows_of(page):
             print(f"{page.name}: {row[0]}: {'recomputed' if source_of(page, source) else NOT_KEPT}")

@@ -164,6 +164,13 @@ def test_published_figures_are_those_of_their_sources(page: Path) -> None:
     assert any(recompute.source_of(page, source) for _, _, source in recompute.rows_of(page))
 
 
+def test_rows_of_the_study_are_rows_of_its_program(tmp_path: Path) -> None:
+    page, head = tmp_path / "study.md", "| | training seeds | SR |\n|---|---|---|\n"
+    page.write_text(f"{head}| ceiling without a memory | – | 33.7 |\n| no memory | 3 | **90.0** |\n")
+    (problem,) = recompute.problems_of_study(page)
+    assert "no memory | 3 | **90.0** is in no table" in problem
+
+
 def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
     assert recompute.problems_of_claims() == []
 

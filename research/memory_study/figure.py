@@ -7,12 +7,11 @@ from statistics import mean
 from typing import Any
 
 from lerobot_memobench.io import draft_of
-from lerobot_memobench.tasks.task import STRICT
 from research.memory_study.grid import Grid
 from research.memory_study.tables import figures_of_rows
 
 SOLVED, FOLLOWS, WITHOUT = "#0072b2", "#e69f00", "#d55e00"
-"""Colours of success, of choices that follow the evidence, and of the best success found without a memory."""
+"""Colours of success, of choices that follow the evidence, and of the ceiling without a memory."""
 ROW_HEIGHT, PANEL_WIDTH = 0.32, 5.6
 """Inches."""
 
@@ -61,8 +60,7 @@ def _draw_suite(axis: Any, suite: str, found: dict[str, dict[str, Any]]) -> None
         axis.text(1, place, f"{mean(found[row]['solved']):.0f}", va="center", fontsize=8, color="white")
     without = found[rows[0]]["without"]
     if without is not None:
-        how = "exact ceiling" if suite == STRICT else "best found"
-        axis.axvline(without, color=WITHOUT, linewidth=2, label=f"{how} without a memory")
+        axis.axvline(without, color=WITHOUT, linewidth=2, label="exact ceiling without a memory")
     axis.set_yticks(places, rows)
     axis.invert_yaxis()
     axis.set_xlim(0, 100)

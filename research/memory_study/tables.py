@@ -24,7 +24,7 @@ REFERENCES = ("no memory", "clock of the execution", "frames", "contrastive")
 """Rows from which the differences of the others are computed."""
 EVIDENCE = "evidence"
 """The control with columns in the first table; the others have a table of their own."""
-FOUND_WITHOUT = "best found without a memory"
+CEILING = "ceiling without a memory"
 EMPTY = "–"
 
 Rows = Mapping[str, Sequence[Cell]]
@@ -47,7 +47,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, last training seed", _conditions(rows)),
         *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
-        (f"Minus *{FOUND_WITHOUT}*", _above_ceiling(rows, grid.suites[suite].ceilings)),
+        (f"Minus *{CEILING}*", _above_ceiling(rows, grid.suites[suite].ceilings)),
         ("The sealed test", _sealed(rows)),
         *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
         ("Cost of a cell, on a shared machine", _costs(rows)),
@@ -167,7 +167,7 @@ def _summary(rows: Rows, ceilings: Mapping[str, float]) -> str:
     lines = [_summary_line(row, cells) for row, cells in rows.items()]
     if ceilings:
         empty = [EMPTY] * (len(header + more) - 3)
-        lines.insert(0, [FOUND_WITHOUT, EMPTY, _figure(_ceiling(ceilings)), *empty])
+        lines.insert(0, [CEILING, EMPTY, _figure(_ceiling(ceilings)), *empty])
     return table_of((*header, *more), lines)
 
 
@@ -225,7 +225,7 @@ def _by_task(rows: Rows, ceilings: Mapping[str, float]) -> str:
         [f"`{name}`", *map(_figure, (ceilings.get(name), *values))]
         for name, *values in zip(names, *solved.values(), strict=True)
     ]
-    return table_of(("", FOUND_WITHOUT, *rows), lines)
+    return table_of(("", CEILING, *rows), lines)
 
 
 def _endings(rows: Rows) -> str:

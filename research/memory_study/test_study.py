@@ -308,7 +308,7 @@ def test_tables_show_evaluated_cells(tmp_path: Path) -> None:
     }
     text = tables(grid, tmp_path, "strict")
     for line in (
-        f"| best found without a memory | – | 33.3 |{8 * ' – |'}",
+        f"| ceiling without a memory | – | 33.3 |{8 * ' – |'}",
         "| no memory | 1 | **40.0** | 10.0–70.0 | 40 | 100.0 | – | 100.0 | – | – | – |",
         f"| `{BUTTER}` | 33.3 | 40.0 | 40.0 |",
         "| frames, no time | 40.0 | 20.0 (-20.0, ",
