@@ -107,7 +107,6 @@ def test_other_kinds_and_seeds_are_refused(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_package_detector_is_measured_and_its_tokens_are_white(tmp_path: Path) -> None:
-    """Its accuracy is not tested: it was trained on the scenes of version 0.2."""
     from lerobot_memobench.perception.objects import ObjectLocalizer
 
     shipped = load_detector(SHIPPED)
@@ -116,8 +115,9 @@ def test_package_detector_is_measured_and_its_tokens_are_white(tmp_path: Path) -
     pictures = DetectorData([BOWLS, DRAWERS], 50_000, 1, 2).pictures(tmp_path, TESTED)
     errors = outcomes(localising(ObjectLocalizer(shipped)), pictures)[0]["error"]
     assert len(errors) > 40
-    assert np.isfinite(errors).any()
+    assert np.isfinite(errors).mean() > 0.9
+    assert np.median(errors) < 0.5  # cm
     with torch.inference_mode():
         tokens = shipped.encoder(images_of(pictures.rows(np.arange(len(pictures))))).flatten(0, 1)
     assert tokens.mean(dim=0).abs().mean() < 0.3
-    assert 0.5 < tokens.var(dim=0).mean() < 2
+    assert 0.3 < tokens.var(dim=0).mean() < 2  # two tasks vary less than the sample that was whitened

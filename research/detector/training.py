@@ -94,7 +94,7 @@ class Training:
     seed: int = 0
     start: str | None = None
     """Detector to begin with, a file or `detector.PACKAGE`; None: random weights. After 40 updates in the scenes of
-    LIBERO, the package's of version 0.2 had a heat loss of 0.87, random weights 3.41."""
+    LIBERO, that of version 0.2 had a heat loss of 0.87, random weights 3.41."""
 
 
 def train(

@@ -12,10 +12,8 @@ A detector is one safetensors file with the names of its kinds.
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -39,8 +37,6 @@ from lerobot_memobench.perception.visual_encoder import (
     VisualEncoder,
     fold_norms,
 )
-
-logger = logging.getLogger(__name__)
 
 LEVELS = 2  # levels of the feature pyramid, each twice as fine as the one before
 FINER = 2**LEVELS  # cells of the finest map along a token's side
@@ -288,7 +284,7 @@ def _interpolated(
 # --- files ---
 
 PACKAGE, SHIPPED = "package", Path(__file__).parent / "detector.safetensors"
-"""Name and file of the package's detector, trained on the scenes that version 0.2 modelled in code."""
+"""Name and file of the package's detector (``results/detector.md``)."""
 
 
 def save_detector(detector: Detector, path: Path) -> None:
@@ -300,16 +296,13 @@ def save_detector(detector: Detector, path: Path) -> None:
 
 
 def load_detector(name: str | Path) -> Detector:
-    """Return the detector of `PACKAGE` or a path in float32 and in evaluation mode; warn about the package's."""
+    """Return the detector of `PACKAGE` or a path in float32 and in evaluation mode."""
     path = detector_file(name)
-    if path == SHIPPED:
-        warn_of_former_scenes()
     try:
         with safe_open(path, framework="pt") as file:
             shape = json.loads(file.metadata()["detector"])
             detector = Detector(VisualEncoder(tuple(shape["widths"]), tuple(shape["blocks"])), tuple(shape["kinds"]))
             detector.fold()
-            # The package's file also holds heads that only its training used.
             detector.load_state_dict({key: file.get_tensor(key).float() for key in detector.state_dict()})
     except (SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
@@ -317,15 +310,6 @@ def load_detector(name: str | Path) -> Detector:
             f"{path} holds no detector ({reason}); name a file of `python -m research.detector train`"
         ) from None
     return detector.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-
-
-@cache
-def warn_of_former_scenes() -> None:
-    """Log once per process that the package's detector was trained on other scenes."""
-    logger.warning(
-        "the package's detector and visual encoder were trained on the scenes of version 0.2, whose objects looked "
-        "different; train one for this version's with `python -m research.detector train` and name its file"
-    )
 
 
 def load_visual_encoder(name: str) -> VisualEncoder:

@@ -260,9 +260,9 @@ class DetectionEncoder(ObjectEncoder):
 # -- detection noise ---------------------------------------------------------------------------------------------------
 
 # Errors like the detector's, added to privileged object state and drawn for every batch. With them, a policy learns
-# from demonstrations without images to act by detections. The sizes are those of the package's detector on 720 frames
-# of the scenes that version 0.2 modelled in code (tuning seeds, arms moved at random): an error of 1.6 mm in the
-# median, 8 mm at the 90th percentile and 18 mm at the 97th.
+# from demonstrations without images to act by detections. The sizes are those of the detector of version 0.2 on
+# 720 frames of its scenes (tuning seeds, arms moved at random): an error of 1.6 mm in the median, 8 mm at the 90th
+# percentile and 18 mm at the 97th. The present one errs by 2.2 and 8.9 mm (`results/detector.md`).
 
 PLACE, KIND_PLACE = (0.0006, 1.45), (0.00065, 1.0)
 """Error of a place in each direction, m, and the standard deviation of the logarithm of its size: per thing, and shared
