@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, line_of, read_lines, write_episodes
+from lerobot_memobench.envs.episode_log import EpisodeLog, has_log, line_of, log_text, read_lines, write_episodes
 from lerobot_memobench.errors import MemobenchError
 from tests.support import logs
 
@@ -42,6 +42,20 @@ def test_newest_line_counts_in_any_file(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.undo()
     log.append(record(steps=3))
     assert [item["steps"] for item in read_lines(tmp_path)] == [3]
+
+
+def test_a_rollout_counts_before_lines_of_an_episode_not_run(tmp_path: Path) -> None:
+    """Whether the merged file or a worker's has it, and whichever is newer."""
+    ran, absent = record(), record(success=False, not_run="no scene")
+    EpisodeLog(tmp_path).append(absent)
+    for merged in ([absent], [ran], [ran, absent]):
+        (tmp_path / "episodes.jsonl").write_text(log_text(merged))
+        write_episodes(tmp_path, [ran])
+        assert read_lines(tmp_path) == [ran]
+        assert (tmp_path / "episodes.jsonl").read_text() == log_text([ran])
+    EpisodeLog(tmp_path / "resumed").append(ran)
+    EpisodeLog(tmp_path / "resumed").append(absent)
+    assert read_lines(tmp_path / "resumed") == [ran]
 
 
 @pytest.mark.parametrize("removed", [1, 2, 17, 100])

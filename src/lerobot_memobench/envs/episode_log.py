@@ -209,12 +209,13 @@ def write_episodes(directory: str | Path, records: Iterable[Mapping[str, Any]]) 
     """
     path = Path(directory) / MERGED_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    logged = {key_of(line): line for line in _read_file(path, [])} if path.is_file() else {}
+    before = [*_read_file(path, [])] if path.is_file() else []
+    logged = _newest(before)
     new = [line for line in map(line_of, records) if logged.get(key_of(line)) != line]
-    if new or not path.is_file():
+    run = {key_of(line) for line in (*before, *new) if "not_run" not in line}
+    stale = {log_text([line]).encode() for line in before if "not_run" in line and key_of(line) in run}
+    if new or stale or not path.is_file():
         content = path.read_bytes() if path.is_file() else b""
-        retried = [line for line in map(logged.get, map(key_of, new)) if line is not None and "not_run" in line]
-        stale = {log_text([line]).encode() for line in retried}
         content = b"".join(line for line in content.splitlines(keepends=True) if line not in stale)
         torn = b"\n" if content and not content.endswith(b"\n") else b""
         write_file(path, content + torn + log_text(new).encode())
@@ -296,8 +297,9 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
     """Return all lines logged in ``directory``, sorted by task and episode, including episodes not run.
 
     Reads the workers' files and ``episodes.jsonl``, which may be compressed by ``gzip``. The newest line of an episode
-    counts. Unreadable lines, such as the last line of a killed run, are skipped. They are added to ``problems`` (file,
-    line, reason), or logged as warnings without it, as are episodes with lines of both outcomes. Raise without a log.
+    counts; *not run* counts only without a rollout. Unreadable lines, such as the last line of a killed run, are
+    skipped. They are added to ``problems`` (file, line, reason), or logged as warnings without it, as are episodes with
+    lines of both outcomes. Raise without a log.
     """
     directory = Path(directory)
     files = _log_files(directory)
@@ -305,8 +307,7 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
         raise _without_log(directory)
     faults: list[str] = []
     lines = [line for file in files for line in _read_file(file, faults)]
-    lines.sort(key=lambda line: line.get(WRITTEN_AT, 0.0))  # stable: of equal times, the last file counts
-    newest = {key_of(line): line for line in lines}
+    newest = _newest(lines)
     outcomes = {(key_of(line), line["success"]) for line in lines if "not_run" not in line}
     if twice := sorted(key for key in newest if {(key, True), (key, False)} <= outcomes):
         faults.append(
@@ -319,6 +320,12 @@ def read_lines(directory: str | Path, problems: list[str] | None = None) -> list
         for fault in faults:
             logger.warning("%s", fault)
     return [{name: value for name, value in newest[key].items() if name != WRITTEN_AT} for key in sorted(newest)]
+
+
+def _newest(lines: Iterable[dict[str, Any]]) -> dict[Key, dict[str, Any]]:
+    # Stable: of equal times, the last file counts.
+    by_time = sorted(lines, key=lambda line: ("not_run" not in line, line.get(WRITTEN_AT, 0.0)))
+    return {key_of(line): line for line in by_time}
 
 
 def _without_log(directory: Path) -> MemobenchError:
