@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -12,7 +14,7 @@ import typer
 
 from lerobot_memobench.cli.console import say
 from lerobot_memobench.commands.command_line import load_plugins
-from lerobot_memobench.conformance.checks import trained_interval
+from lerobot_memobench.envs.evaluation_file import POLICY
 from lerobot_memobench.envs.observations import obs_type_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.evaluation.comparison import compare_evaluations
@@ -26,11 +28,14 @@ from research.command import run
 from research.memory_study.commands import run_once
 from research.memory_study.tables import EMPTY, table_of
 
-INTERVALS = (1, 5, 10, 20)
+INTERVALS = (1, 5, 10, 16)
 FED = (STEPS, PLANS) = ("each step", "each plan")
 """When the policy observes the execution. A policy that plans at each step does both, and is run once."""
 STYLES = {STEPS: {"color": "#0072b2", "fmt": "o-"}, PLANS: {"color": "#d55e00", "fmt": "s--"}}
-AT_PLANS = ("policy=fed_at_plans", "policy.discover_packages_path=research.update_interval.at_plans")
+NAME = re.compile(rf"([^/]+)/(?:{STEPS}|{PLANS}), \d+")
+"""Name of a kept evaluation of a sweep."""
+FED_AT_PLANS = "fed_at_plans"
+AT_PLANS = (f"policy={FED_AT_PLANS}", "policy.discover_packages_path=research.update_interval.at_plans")
 HEADER = (
     *("policy", "plan interval", "memory fed at", "memory interval in training", "in rollouts"),
     *("SR", "follows evidence", "SR, change from each step", "rollouts"),
@@ -55,38 +60,61 @@ Runs = Mapping[Place, Run]
 
 def sweep(
     out: Annotated[Path, typer.Option(help="Folder of all results; the same command resumes.")],
-    policy: Annotated[list[str], typer.Option(help="NAME=FOLDER of a trained policy; repeatable.")],
+    policy: Annotated[list[str] | None, typer.Option(help="NAME=FOLDER of a trained policy; repeatable.")] = None,
     settings: Annotated[list[str] | None, typer.Argument(help="Settings of every evaluation: tasks=object.")] = None,
-    replan: Annotated[list[int] | None, typer.Option(help="A plan interval; 1, 5, 10 and 20 if omitted.")] = None,
+    replan: Annotated[list[int] | None, typer.Option(help="A plan interval; 1, 5, 10 and 16 if omitted.")] = None,
     keep: Annotated[Path | None, typer.Option(help="Add the evaluations to the Parquet tables here.")] = None,
-    kept: Annotated[Path | None, typer.Option(help="Take the evaluations from the Parquet tables here.")] = None,
+    kept: Annotated[
+        Path | None, typer.Option(help="Make table and figure of the Parquet tables here, without any other option.")
+    ] = None,
 ) -> None:
     """Evaluate every policy at every plan interval, then print and write the table and the figure."""
-    checkpoints = dict(map(read_policy, policy))
-    places = [
-        Place(name, steps, fed)
-        for name, (_, config) in checkpoints.items()
-        for steps in sorted(replan or INTERVALS)
-        for fed in FED[: 1 if steps == 1 else 2]
-        if steps <= config.chunk_size
-    ]
+    if (kept is None) is not bool(policy) or (kept is not None and (settings or replan or keep)):
+        raise MemobenchError("expected --policy NAME=FOLDER, or --kept alone; give one of them")
     if kept is not None:
-        store.restore(kept, out, [place.name for place in places])
+        with tempfile.TemporaryDirectory() as folder:
+            names = [name for name in store.restore(kept, Path(folder)) if NAME.fullmatch(name)]
+            if not names:
+                raise MemobenchError(f"{kept} holds no evaluation of a sweep; give a folder that --keep has written")
+            show(Path(folder), names, out)
+        return
+    checkpoints, intervals = dict(map(read_policy, policy or [])), sorted(replan or INTERVALS)
+    for name, (_, config) in checkpoints.items():
+        if intervals[-1] > config.chunk_size:
+            raise MemobenchError(
+                f"found a plan interval of {intervals[-1]} and chunks of {config.chunk_size} actions of {name}; name "
+                "intervals up to that by --replan"
+            )
+    places = [
+        Place(name, steps, fed) for name in checkpoints for steps in intervals for fed in FED[: 1 if steps == 1 else 2]
+    ]
     for place in places:
         words = [*words_of(place, *checkpoints[place.policy]), *(settings or []), f"output_dir={out / place.name}"]
         run_once(words, out / f"{place.name}.log", how=["resume=true"])
+    names = [place.name for place in places]
     if keep is not None:
-        store.keep(out, [place.name for place in places], keep)
-    runs = {place: read_run(out / place.name) for place in places}
-    trained = {name: trained_interval(config) for name, (_, config) in checkpoints.items()}
-    text = table_of(HEADER, [row(place, runs, trained[place.policy]) for place in places])
-    for name, (_, config) in checkpoints.items():
-        for steps in sorted(replan or INTERVALS):
-            if steps > config.chunk_size:
-                text += f"\n\n{name}: replan={steps} was not run, a chunk has {config.chunk_size} actions."
+        store.keep(out, names, keep)
+    show(out, names, out)
+
+
+def show(source: Path, names: Iterable[str], out: Path) -> None:
+    """Print the table of the evaluations of these names in ``source``; write it and the figure."""
+    runs = runs_of(source, names)
+    text = table_of(HEADER, [row(place, runs) for place in runs])
+    out.mkdir(parents=True, exist_ok=True)
     write_file(out / "interval.md", f"{text}\n")
     draw(runs, out / "interval.png")
     say(text)
+
+
+def runs_of(source: Path, names: Iterable[str]) -> Runs:
+    """Return the evaluations of these names in ``source``; plan interval and feeding are those of their cards."""
+    found = {}
+    for name in names:
+        run = read_run(source / name)
+        fed = PLANS if run.card[POLICY]["type"] == FED_AT_PLANS else STEPS
+        found[Place(name.partition("/")[0], run.protocol["replan_steps"], fed)] = run
+    return {place: found[place] for place in sorted(found, key=lambda each: (*each[:2], FED.index(each.fed)))}
 
 
 def read_policy(word: str) -> tuple[str, tuple[Path, Any]]:
@@ -112,14 +140,16 @@ def words_of(place: Place, checkpoint: Path, config: Any) -> Iterator[str]:
         yield f"obs_type={obs_type}"
 
 
-def row(place: Place, runs: Runs, trained: int | None) -> list[str]:
-    """Return a row of the table; ``trained``: control steps between frames of the history in training."""
-    found = runs[place]
+def row(place: Place, runs: Runs) -> list[str]:
+    """Return a row of the table; the memory interval is that of the policy fed at each step, by its card."""
+    found, base = runs[place], runs[place._replace(fed=STEPS)]
     rate, evidence = found.summary.average["SR"], found.evidence
     follows = None if evidence is None or evidence.average is None else evidence.average.rates["follows"]
+    settings = base.card[POLICY]["settings"]
+    trained = settings.get("memory_stride", settings.get("stride"))  # of memobench_mem, of the plug-in example
     change, acted = EMPTY, trained
     if place.fed == PLANS:
-        success = compare_evaluations(runs[place._replace(fed=STEPS)], found, permutations=100).contrasts[0]
+        success = compare_evaluations(base, found, permutations=100).contrasts[0]
         low, high = map(percent_text, success.interval)
         change = f"{percent_text(success.value, sign=True)} [{low} to {high}]"
         acted = None if trained is None else trained * place.replan

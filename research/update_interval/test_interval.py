@@ -1,4 +1,4 @@
-"""A policy fed at plans sees prompts and plans alone, and the sweep names what it compares and what it did not run."""
+"""A policy fed at plans sees prompts and plans alone; the sweep names what it compares, and repeats its table."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_frames_between_plans_are_hidden(
             subject.roll(subject.streams[:1])
 
 
-def test_the_table_names_both_intervals_and_what_was_not_run(
+def test_the_table_names_both_intervals_and_is_made_again_of_the_kept_tables(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ran = []
@@ -95,18 +95,39 @@ def test_the_table_names_both_intervals_and_what_was_not_run(
     def evaluate(words: list[str], log: Path, how: list[str]) -> None:
         given = dict(word.split("=", 1) for word in words[2:])
         ran.append((given["policy"] == "fed_at_plans", int(given["replan"])))
-        good = 1 if given["policy"] == "fed_at_plans" else 3
-        evaluation(Path(given["output_dir"]), good, replan_steps=int(given["replan"]))
+        good, card = 3, {"type": "memobench_mem", "settings": {"memory_stride": 8}}
+        if given["policy"] == "fed_at_plans":
+            good, card = 1, {"type": "fed_at_plans", "settings": {}}
+        evaluation(Path(given["output_dir"]), good, policy=card, replan_steps=int(given["replan"]))
 
     monkeypatch.setattr(program, "run_once", evaluate)
-    program.sweep(tmp_path, [f"mine={STRICT}"], ["tasks=object"], keep=tmp_path / "kept")
-    assert ran == [(False, 1), (False, 5), (True, 5), (False, 10), (True, 10)]
-    lines = capsys.readouterr().out.splitlines()
+    program.sweep(tmp_path / "first", [f"mine={STRICT}"], ["tasks=object"], keep=tmp_path / "kept")
+    assert ran == [(False, 1), (False, 5), (True, 5), (False, 10), (True, 10), (False, 16), (True, 16)]
+    text = capsys.readouterr().out
+    lines = text.splitlines()
     assert lines[0].startswith("| policy | plan interval | memory fed at |")
     assert "| mine | 1 | both | 8 | 8 | 75.0 " in lines[2]
-    assert "| mine | 10 | each step | 8 | 8 | 75.0 " in lines[5]
-    assert "| mine | 10 | each plan | 8 | 80 | 25.0 " in lines[6]
-    assert "| -50.0 [" in lines[6]
-    assert "mine: replan=20 was not run, a chunk has 16 actions." in lines
-    assert (tmp_path / "interval.png").stat().st_size > 10_000
-    program.store.restore(tmp_path / "kept", tmp_path / "again", ["mine/each plan, 10"])
+    assert "| mine | 16 | each step | 8 | 8 | 75.0 " in lines[7]
+    assert "| mine | 16 | each plan | 8 | 128 | 25.0 " in lines[8]
+    assert "| -50.0 [" in lines[8]
+    assert (tmp_path / "first" / "interval.png").stat().st_size > 10_000
+
+    evaluation(tmp_path / "other")
+    program.store.keep(tmp_path, ["other"], tmp_path / "kept")  # of another program
+    program.sweep(tmp_path / "again", kept=tmp_path / "kept")
+    assert (capsys.readouterr().out, len(ran)) == (text, 7)
+    assert (tmp_path / "again" / "interval.md").read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({}, "give one"),
+        ({"policy": ["mine=x"], "kept": Path("kept")}, "give one"),
+        ({"replan": [5], "kept": Path("kept")}, "give one"),
+        ({"policy": [f"mine={STRICT}"], "replan": [20]}, "interval of 20 and chunks of 16"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(tmp_path: Path, given: dict[str, Any], named: str) -> None:
+    with pytest.raises(MemobenchError, match=named):
+        program.sweep(tmp_path, **given)
