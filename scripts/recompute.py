@@ -13,6 +13,7 @@ Claims in other places are listed in ``results/figures.md``, each with the words
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -241,7 +242,7 @@ def problems_of_claims(claims: Path = CLAIMS) -> list[str]:
 
 def _claims(page: Path) -> list[list[str]]:
     """Return the rows of the list of claims: page, claim, source, words of the source, whether rollouts are kept."""
-    return [row for head, rows in tables(page) if head[:2] == ["page", "it says"] for row in rows]
+    return [row for head, rows in tables(page) if head[:2] == ["page", "claim"] for row in rows]
 
 
 def _place(page: Path, link: str) -> Path:
@@ -272,6 +273,18 @@ def keep_evaluation(folder: Path, name: str) -> str:
     return f"| {cells} | [`{name}`](../../results/evaluations/{ROLLOUT_TABLE}) |"
 
 
+def restore_evaluation(kept: Path, name: str, folder: Path) -> None:
+    """Write a kept evaluation as a new folder."""
+    if folder.exists():
+        raise MemobenchError(f"{folder} exists already; name a new folder")
+    with tempfile.TemporaryDirectory() as root:
+        restore(kept, Path(root), [name])
+        if not (restored := Path(root) / name).is_dir():
+            raise MemobenchError(f"{kept} has the command of {name!r} alone, no rollouts; name an evaluation")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        shutil.move(restored, folder)
+
+
 def main(words: list[str]) -> int:
     """Run the command line; return the exit status."""
     match words:
@@ -279,9 +292,7 @@ def main(words: list[str]) -> int:
             print(keep_evaluation(Path(folder), name))
             return 0
         case ["restore", kept, name, folder]:
-            with tempfile.TemporaryDirectory(dir=Path(folder).resolve().parent) as root:
-                restore(Path(kept), Path(root), [name])
-                (Path(root) / name).rename(folder)
+            restore_evaluation(Path(kept), name, Path(folder))
             return 0
         case []:
             pass

@@ -173,6 +173,7 @@ def test_rows_of_the_study_are_rows_of_its_program(tmp_path: Path) -> None:
 
 def test_claims_and_their_sources_stand_where_the_list_has_them() -> None:
     assert recompute.problems_of_claims() == []
+    assert recompute._claims(recompute.CLAIMS)
 
 
 def test_tables_of_results_are_small() -> None:
@@ -211,6 +212,18 @@ def keep_one(folder: Path, lines: list[dict[str, Any]]) -> None:
     """Keep a log under the name ``one`` in the folder's tables."""
     write_log(folder / "logs" / "one", lines)
     kept.keep(folder / "logs", ["one"], folder)
+
+
+def test_a_kept_evaluation_is_restored_as_a_new_folder(tmp_path: Path) -> None:
+    keep_one(tmp_path, [rollout("turn_on_the_stove_and_turn_it_off", "temporal", "S", [True], True, 0)])
+    (tmp_path / "logs" / "training.json").write_text("{}")
+    kept.keep(tmp_path / "logs", ["training"], tmp_path)
+    folder = tmp_path / "outputs" / "one"
+    assert recompute.main(["restore", str(tmp_path), "one", str(folder)]) == 0
+    assert [line["success"] for line in episode_log.read_lines(folder)] == [True]
+    for name, target, words in (("one", folder, "exists already"), ("training", tmp_path / "b", "no rollouts")):
+        with pytest.raises(MemobenchError, match=words):
+            recompute.main(["restore", str(tmp_path), name, str(target)])
 
 
 # --- commands ---
