@@ -7,7 +7,7 @@
 
 All parts are built and checked before the first is uploaded. The dry run gives the commands of an upload the addresses
 of two local servers, then installs the wheel by its name in an empty environment and evaluates there. An upload refuses
-uncommitted changes, a part that is not at hand, and a version of which the index has another wheel. The same command
+uncommitted changes, a part that is not at hand, and a version if the index has another wheel of it. The same command
 continues an interrupted upload: index and hub skip files whose hash they have. The last lines are what is left to do by
 hand. The site becomes a static Space, because no workflow publishes it.
 """
@@ -94,8 +94,10 @@ def weights_of_rows(checkpoints: Sequence[Path]) -> tuple[dict[str, Path], str]:
     found, absent = shipped_policies(), []
     for file in sorted((ROOT / "results/board").glob("*/evaluation.json")):
         checkpoint = json.loads(file.read_text())["checkpoint"] or {}
-        hashes = checkpoint.get("files")  # a scripted policy has none, nor has one that is on the hub
-        if hashes is None or any(checkpoint_files(folder) == hashes for folder in found.values()):
+        hashes = checkpoint.get("files")  # a scripted policy has none
+        if hashes is None or checkpoint.get("revision"):  # one from the hub has a revision, and is there already
+            continue
+        if any(checkpoint_files(folder) == hashes for folder in found.values()):
             continue
         if given := [folder for folder in checkpoints if checkpoint_files(folder) == hashes]:
             found[file.parent.name] = given[0]
@@ -144,7 +146,7 @@ def refuse(parts: Mapping[str, Part]) -> None:
 
 
 def refuse_other_wheel(wheel: Path, environment: Mapping[str, str]) -> None:
-    """Refuse a version of which the index has another wheel."""
+    """Refuse a version if the index has another wheel of it."""
     with tempfile.TemporaryDirectory() as folder:
         options = f"-q --no-cache-dir --no-deps --only-binary :all: -d {folder}"
         words = shlex.split(f"python -m pip download {options} {NAME}=={VERSION}")
@@ -186,7 +188,7 @@ def rehearse(parts: Mapping[str, Part], out: Path, user: str, installed: bool) -
 
 
 def try_installed(index: str, policies: Sequence[str], environment: Mapping[str, str], folder: Path) -> None:
-    """Install the package by its name in an empty environment; evaluate policies there, of which the first succeeds."""
+    """Install the package by its name in an empty environment; evaluate policies there; the first must succeed."""
     clean = {key: value for key, value in environment.items() if not key.startswith(("PYTHON", "VIRTUAL_ENV"))}
     run(f"uv venv -q --python {quote(Path(sys.executable))} env", clean, folder)
     run(f"uv pip install -p env --index {index} {NAME}", clean, folder)
@@ -198,17 +200,19 @@ def try_installed(index: str, policies: Sequence[str], environment: Mapping[str,
         raise SystemExit(f"publish: {policies[0]} failed in {TRIED}")
 
 
-def left(parts: Mapping[str, Part], user: str) -> str:
+def left(parts: Mapping[str, Part], user: str, uploaded: bool = False) -> str:
     """Return what is left to do by hand, in the order in which a person does it."""
+    upload = f"""\
+- Upload. Not seen yet: whether the index grants the name, how the hub stores files and shows its pages.
+
+    {"=... ".join(TOKENS)}=... python scripts/publish.py --user {user} --upload
+
+"""
     missing = "".join(f"- {name}: {part.missing}\n" for name, part in parts.items() if part.missing)
     return f"""
 Left to do by hand:
 
-{missing}- Upload. Not seen yet: whether the index grants the name, how the hub stores files and shows its pages.
-
-    {"=... ".join(TOKENS)}=... python scripts/publish.py --user {user} --upload
-
-- On another machine:
+{missing}{"" if uploaded else upload}- On another machine:
 
     pip install {NAME}=={VERSION} mujoco==3.9.0
     memobench doctor
@@ -252,7 +256,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         publish(parts, out, given.user, programs())
     else:
         rehearse(parts, out, given.user, "install" in given.only)
-    print(left(parts, given.user))
+    print(left(parts, given.user, given.upload and not given.plan and given.only == PARTS))
 
 
 if __name__ == "__main__":

@@ -97,12 +97,18 @@ def test_weights_of_a_row_of_the_board_are_required(tmp_path: Path, monkeypatch:
     (mine / "model.safetensors").write_bytes(b"weights")
     shipped = shipped_policies()
     rows = {"scripted": None, "known": {"files": checkpoint_files(shipped["memobench_strict"])}}
+    rows["from the hub"] = {"files": {"model.safetensors": "1" * 64}, "revision": "2" * 40}
     for row, checkpoint in {**rows, "lost": {"files": checkpoint_files(mine)}}.items():
         (tmp_path / "results/board" / row).mkdir(parents=True)
         (tmp_path / "results/board" / row / "evaluation.json").write_text(json.dumps({"checkpoint": checkpoint}))
     found, absent = publish.weights_of_rows([])
     assert (found, absent.endswith("rows lost")) == (shipped, True)
     assert publish.weights_of_rows([mine]) == ({**shipped, "lost": mine}, "")
+
+
+def test_a_finished_upload_is_not_left_to_do(parts: dict[str, publish.Part]) -> None:
+    assert "- Upload." in publish.left(parts, "somebody")
+    assert "- Upload." not in publish.left(parts, "somebody", uploaded=True)
 
 
 # --- uploads ---

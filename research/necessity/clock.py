@@ -52,7 +52,7 @@ def bin_of(elapsed: float) -> int:
 
 
 class Clock:
-    """A task of which a policy knows the elapsed steps alone.
+    """A task, for a policy that knows the elapsed steps alone.
 
     Args:
         wanted: right choices in order, from 0.

@@ -4,4 +4,4 @@ Importing this package imports nothing else, so commands that need no LeRobot st
 is in ``registration``, which ``lerobot_policy_memobench``, the name that LeRobot discovers, imports.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
