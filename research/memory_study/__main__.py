@@ -39,7 +39,7 @@ def study(
     ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder of the figure; --out by default.")] = None,
     controls: Annotated[bool, typer.Option(help="Run the controls, after all cells.")] = True,
-    sealed: Annotated[bool, typer.Option("--sealed", help="Run the sealed test too: once, last.")] = False,
+    sealed: Annotated[bool, typer.Option("--sealed", help="Run the sealed test of its rows too: once, last.")] = False,
     workers: Annotated[int, typer.Option(min=1, help="Cells at a time.")] = 1,
 ) -> None:
     """Train and evaluate every missing cell, then print and write the tables and the figure."""
@@ -48,6 +48,8 @@ def study(
     if not places:
         raise MemobenchError(f"--only {' '.join(only or [])} matches no cell; a row may have fewer training seeds")
     if kept is not None:
+        if only or keep or plan:
+            raise MemobenchError("--kept makes the tables of all kept cells; leave out --only, --keep and --plan")
         with tempfile.TemporaryDirectory() as restored:
             restore(kept, Path(restored))
             write_results(read, Path(restored), out, figures)
@@ -65,6 +67,8 @@ def study(
         return
     for cell in {(cell.suite, cell.row): cell for cell in cells}.values():
         cell.check()
+    if sealed and not any(read.rows[cell.row].sealed for cell in cells):
+        raise MemobenchError("--sealed: the plan has no sealed test of these rows; choose others by --only or --grid")
     if plan:
         say(planned(data, cells, workers))
         return
@@ -83,6 +87,10 @@ def study(
 def write_results(grid: Grid, source: Path, out: Path, figures: Path | None) -> None:
     """Print the tables of the cells in ``source``; write them and the figure."""
     text = "\n\n".join(filter(None, (tables(grid, source, suite) for suite in grid.suites)))
+    if not text:
+        raise MemobenchError(
+            "there is no evaluated cell of the study's file; name another --grid, or evaluate one first"
+        )
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "study.md", text + "\n")
     folder = figures or out

@@ -71,7 +71,7 @@ class Cell:
 
     Attributes:
         out: the study's folder.
-        sealed: whether the sealed test is run too.
+        sealed: whether the sealed test is run too, if the row has it.
         at_once: cells that run at the same time, this one included.
         controlled: whether the controls of a row's last training seed are run too.
     """
@@ -107,10 +107,11 @@ class Cell:
 
     @property
     def parts(self) -> list[str]:
-        """The evaluation, the controls of a row's last training seed, and the sealed test where it is wanted."""
+        """The evaluation, the controls of a row's last training seed, and the sealed test if wanted, of its rows."""
         row = self.grid.rows[self.row]
         controls = row.controls if self.controlled and self.seed == row.seeds - 1 else ()
-        return [ROLLOUTS, *controls, *([SEALED] if self.sealed or has_ended(self.log(SEALED)) else [])]
+        sealed = self.sealed and row.sealed
+        return [ROLLOUTS, *controls, *([SEALED] if sealed or has_ended(self.log(SEALED)) else [])]
 
     def evaluation(self, part: str) -> Path:
         """Return the folder of the evaluation or of a control."""
@@ -171,9 +172,9 @@ class Cell:
 
     def evaluation_words(self, part: str) -> list[str]:
         """Return the command that rolls its policy out."""
-        row, suite = self.grid.rows[self.row], self.grid.suites[self.suite]
+        suite = self.grid.suites[self.suite]
         own = self.grid.sealed if part == SEALED else self.grid.controls.get(part, [])
-        words = [*self.grid.evaluation, *suite.evaluation, *suite.task_words, *row.evaluation, *own]
+        words = [*self.grid.evaluation, *suite.evaluation, *suite.task_words, *own]
         command = ["lerobot", "eval", "env=memobench"]
         if part == SEALED:
             command = ["memobench", "test-sealed"]

@@ -59,18 +59,17 @@ class Row:
     """A policy of the table.
 
     Attributes:
-        training: words of ``lerobot train``. evaluation: of ``lerobot eval env=memobench``.
+        training: words of ``lerobot train``.
         policy: words of ``lerobot train`` that choose the policy; none: the grid's.
-        seeds: number of training seeds, from 0 on. controls: names of controls that seed 0 runs.
-        privileged: the row has inputs, in training or rollouts, that the others lack.
+        seeds: number of training seeds, from 0 on. controls: names of controls that the last seed runs.
+        sealed: whether the sealed test includes the row.
     """
 
     training: list[str] = field(default_factory=list)
-    evaluation: list[str] = field(default_factory=list)
     policy: list[str] = field(default_factory=list)
     seeds: int = 1
     controls: list[str] = field(default_factory=list)
-    privileged: bool = False
+    sealed: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ class Grid:
             if same := [name for name, folder in zip(names, folders, strict=True) if folders.count(folder) > 1]:
                 raise MemobenchError(f"the {kind} {', '.join(same)} have the same folder; rename one")
         for name in self.rows:
-            if re.search(r"[|\n]|\(privileged\)$", name) or name in self.suites or re.fullmatch(SEED, name):
+            if re.search(r"[|\n]", name) or name in self.suites or re.fullmatch(SEED, name):
                 raise MemobenchError(
                     f"invalid name of a row: {name!r} is a suite, a seed, or breaks a table; rename it"
                 )
@@ -121,9 +120,6 @@ class Grid:
 
     def _check_row(self, name: str, row: Row) -> None:
         _refuse_words(f"row {name!r}, training", [*self.training, *row.training], (*PLACES, "seed", "dataset"))
-        _refuse_words(
-            f"row {name!r}, evaluation", row.evaluation, (*PLACES, "tasks", "policy", "seed", "episodes", "split")
-        )
         for control in row.controls:
             if control not in self.controls:
                 raise MemobenchError(f"row {name!r} names the control {control!r}; {nearest(control, self.controls)}")

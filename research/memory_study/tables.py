@@ -28,7 +28,7 @@ CEILING = "ceiling without a memory"
 EMPTY = "–"
 
 Rows = Mapping[str, Sequence[Cell]]
-"""Title of a row -> its evaluated cells, in the order of training seeds."""
+"""Name of a row -> its evaluated cells, in the order of training seeds."""
 
 
 def tables(grid: Grid, out: Path, suite: str) -> str:
@@ -56,7 +56,7 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
 
 
 def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, Any]]:
-    """Return title of a row -> "solved" (SR) and "follows" per training seed, and "without" a memory, per cent."""
+    """Return name of a row -> "solved" (SR) and "follows" per training seed, and "without" a memory, per cent."""
     found, ceiling = {}, _ceiling(grid.suites[suite].ceilings)
     for row, cells in evaluated_rows(grid, out, suite).items():
         evidence = _evidence(cells)
@@ -71,15 +71,10 @@ def figures_of_rows(grid: Grid, out: Path, suite: str) -> dict[str, dict[str, An
 # -- evaluated cells --------------------------------------------------------------------------------------------------
 
 
-def titles(grid: Grid) -> list[str]:
-    """Return the titles of the rows in tables and figures, in their order."""
-    return [name + (" (privileged)" if row.privileged else "") for name, row in grid.rows.items()]
-
-
 def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
-    """Return title -> evaluated cells of the rows of a suite."""
+    """Return name -> evaluated cells of the rows of a suite."""
     found: dict[str, list[Cell]] = {}
-    for title, (name, row) in zip(titles(grid), grid.rows.items(), strict=True):
+    for name, row in grid.rows.items():
         for cell in (Cell(grid, out, suite, name, seed) for seed in range(row.seeds)):
             trained = cell.done(TRAINING)  # once, for all its evaluations
             if evaluated(cell, ROLLOUTS):
@@ -88,7 +83,7 @@ def evaluated_rows(grid: Grid, out: Path, suite: str) -> dict[str, list[Cell]]:
                         f"{cell.evaluation(ROLLOUTS)} is of a training that has not ended by "
                         f"{cell.log(TRAINING).with_suffix('.json')}; restore that file, or remove {cell.folder}"
                     )
-                found.setdefault(title, []).append(cell)
+                found.setdefault(name, []).append(cell)
     return found
 
 

@@ -36,7 +36,7 @@ evaluation: [split=validation, episodes=2, videos=0]
 suites: {strict: {demonstrations: [--suite, strict], evaluation: [suite=strict]}}
 controls: {evidence: [evidence=true, episodes=12]}
 rows:
-  no memory: {training: [policy.memory=none], seeds: 2}
+  no memory: {training: [policy.memory=none], seeds: 2, sealed: true}
   frames, no time: {training: [], seeds: 1, controls: [evidence]}
 """
 COMMAND = {"words": [], "ended": False, "wall_s": 60.0, "cpu_s": 50.0}
@@ -93,7 +93,6 @@ def test_commands_of_the_study_are_understood(tmp_path: Path) -> None:
         ("evaluation: [suite=strict]", "evaluation: []", "rollouts of published"),
         ("[--suite, strict]", "[--suite, strict, --tasks, object]", "--tasks"),
         ("training: [steps=4,", "training: [seed=1, steps=4,", "seed="),
-        ("training: [],", "training: [], evaluation: [episodes=1],", "episodes="),
         ("frames, no time:", "frames | time:", "'frames | time'"),
         ("frames, no time:", "strict:", "'strict'"),
         ("frames, no time:", "seed=1:", "'seed=1'"),
@@ -139,8 +138,11 @@ def test_controls_are_of_the_last_training_seed(tmp_path: Path) -> None:
     assert (first.parts, last.parts) == ([ROLLOUTS], [ROLLOUTS, "evidence"])
 
 
-def test_sealed_test_is_run_once_where_wanted(no_memory: Cell) -> None:
+def test_sealed_test_is_run_once_where_wanted(no_memory: Cell, frames: Cell, tmp_path: Path) -> None:
     assert no_memory.parts == [ROLLOUTS]
+    assert replace(frames, sealed=True).parts == [ROLLOUTS, "evidence"], "the row has no sealed test"
+    with pytest.raises(MemobenchError, match="no sealed test"):
+        study(tmp_path / "out", tmp_path / "grid.yaml", only=["frames, no time"], sealed=True)
     sealed = replace(no_memory, sealed=True)
     assert sealed.parts == [ROLLOUTS, SEALED]
     words = sealed.evaluation_words(SEALED)
@@ -393,6 +395,19 @@ def test_cells_are_kept_and_restored(no_memory: Cell, frames: Cell, tmp_path: Pa
     text = (tmp_path / "again" / "study.md").read_text()
     assert text == tables(frames.grid, tmp_path, "strict") + "\n"
     assert (tmp_path / "again" / "study.png").stat().st_size > 5_000
+
+
+def test_kept_cells_are_tabulated_whole_or_refused(no_memory: Cell, tmp_path: Path) -> None:
+    evaluate(no_memory, ROLLOUTS)
+    grid, kept = tmp_path / "grid.yaml", tmp_path / "kept"
+    study(tmp_path, grid, keep=kept)
+    for more in ({"only": ["no memory"]}, {"keep": kept}, {"plan": True}):
+        with pytest.raises(MemobenchError, match="leave out"):
+            study(tmp_path / "again", grid, kept=kept, **more)
+    grid.write_text(SMALL.replace("suites: {strict:", "suites: {other:"))
+    with pytest.raises(MemobenchError, match="no evaluated cell"):
+        study(tmp_path / "again", grid, kept=kept)
+    assert not (tmp_path / "again").exists()
 
 
 def test_a_dataset_is_kept_as_its_command(no_memory: Cell, tmp_path: Path) -> None:
