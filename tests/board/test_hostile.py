@@ -157,7 +157,7 @@ STRICT: dict[str, tuple[Change, str]] = {
     ),
     # numbers that no log holds
     "held longer than a rollout": (every(put(held_steps=10**9)), "found held_steps=1000000000"),
-    "holds left out": (every(lambda record: record.pop("held_steps")), "found held_steps=-1"),
+    "holds left out": (every(lambda record: record.pop("held_steps")), "found held_steps=None"),
     "over before it began": (one(put(wall_s=-1.0)), r"wall_s=-1\.0"),
     "lines of another end": (
         lambda folder: (folder / LOG).write_bytes(

@@ -169,13 +169,12 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 def _check_log(run: Submitted) -> None:
     _check_inputs(run)
     _check_policy(run)
-    most, absent = longest(_check_plan(run)), -1 if run.protocol["suite"] == STRICT else 0
+    most, absent = longest(_check_plan(run)), None if run.protocol["suite"] == STRICT else 0
     for record in run.records:
         _check_record(run, record)
-        if not 0 <= (held := record.get("held_steps", absent)) <= most or (record.get("wall_s") or 0) < 0:
-            raise MemobenchError(
-                f"{run.folder}: found held_steps={held}, wall_s={record.get('wall_s')}; at most {most}"
-            )
+        held, wall = record.get("held_steps", absent), record.get("wall_s") or 0
+        if held is None or not 0 <= held <= most or wall < 0:
+            raise MemobenchError(f"{run.folder}: found held_steps={held} and wall_s={wall}; submit the log unchanged")
     if (problem := first_variant_mismatch(run.records)) is not None:
         raise MemobenchError(f"{run.folder}: another version drew the variants ({problem}); evaluate with this version")
 
@@ -300,9 +299,7 @@ def _check_plan(run: Submitted) -> EnvSettings:
     except Exception as error:  # a card may hold any values
         problems.append(" ".join(str(error).split()))
     if problems:
-        raise MemobenchError(
-            f"{run.folder}: the policy's settings contradict its plans ({problems[0]}); submit the card unchanged"
-        )
+        raise MemobenchError(f"{run.folder}: its plans are not its policy's ({problems[0]}); submit the card unchanged")
     return own.settings
 
 
@@ -350,9 +347,9 @@ def _check_mark(run: Submitted, about: About) -> None:
     decisive: Any = {name: str(_block(policy.get("settings")).get(name)) for name in DECISIVE}
     if policy.get("type") != MEMORY_POLICY:
         return
-    if decisive["memory"] not in (NONE, *OURS, str(None)):  # of a plugin, which is not here: the alignment decides
-        decisive["memory"] = MemobenchMemConfig.memory
-    if MemobenchMemConfig(device="cpu", **decisive).supervised_with_answer and not marked:
+    plugin = decisive["memory"] not in (NONE, *OURS, str(None))  # it is not here: the alignment alone decides
+    known = decisive | ({"memory": MemobenchMemConfig.memory} if plugin else {})
+    if MemobenchMemConfig(device="cpu", **known).supervised_with_answer and not marked:
         raise MemobenchError(
             f"{run.folder}: supervised_with_answer is false on the card of a policy with {decisive}; submit the card "
             "unchanged"
