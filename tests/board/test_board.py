@@ -32,6 +32,7 @@ from tests.support.board import (
     IMAGES,
     TASKS,
     VERSIONS,
+    both,
     evaluation,
     first_failure,
     in_card,
@@ -195,9 +196,14 @@ def test_doctored_control_is_refused(with_controls: Path, tmp_path: Path, name: 
 
 def of_memory(recorded: bool | None = None, **settings: Any) -> Callable[[Path], None]:
     """Make the card one of `memobench_mem` with pixels; ``recorded`` replaces its mark."""
-    config = encoded_config(MemobenchMemConfig(device="cpu", **settings)) | {"input_features": IMAGES}
-    config |= {} if recorded is None else {"supervised_with_answer": recorded}
-    return in_card(lambda card: card["policy"].update(type="memobench_mem", settings=config))
+    config = encoded_config(MemobenchMemConfig(device="cpu", n_action_steps=5, **settings))
+    config |= {"input_features": IMAGES} | ({} if recorded is None else {"supervised_with_answer": recorded})
+
+    def change(card: Json) -> None:
+        card["policy"].update(type="memobench_mem", settings=config)
+        card["submission"].pop("supervised_with_answer", None)
+
+    return in_card(change)
 
 
 @pytest.mark.parametrize(
@@ -227,6 +233,15 @@ def test_row_is_marked_by_its_policy(
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
+        (both(of_memory(align="contrastive"), stating("supervised_with_answer", False)), "True, and False is stated"),
+        (both(of_memory(), stating("supervised_with_answer", True)), "False, and True is stated"),
+        (
+            both(
+                of_memory(False, align="contrastive"),
+                in_card(lambda card: card["policy"]["settings"].update(memory="a_plugins")),
+            ),
+            "is false on the card of a policy with",
+        ),
         (of_memory(False, align="contrastive"), "is false on the card of a policy with"),
         (of_memory(False, memory="keyframes"), "is false on the card of a policy with"),
         (
@@ -288,9 +303,36 @@ def test_table_of_public_scenes_is_no_better_than_chance(each_variant: Path, boa
     assert (found.rates["follows"].value or 1.0) <= found.chance
 
 
+def of_task(name: str, success: bool = True, **fields: Any) -> Callable[[Path], None]:
+    """Change the first rollout of a task with this outcome: a failure of variant 0, a success of variant 1."""
+
+    def change(log: list[Json]) -> None:
+        next(each for each in log if each["task"].startswith(name) and each["success"] == success).update(fields)
+
+    return in_log(change)
+
+
+def test_first_object_may_be_put_back_before_a_success(each_variant: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(each_variant, tmp_path / "one")
+    of_task("put_only_the_butter", choice=0)(folder)
+    of_task("find_the_tomato_hidden", success=False, choice=1, answered=True, lost=True, failure="wrong_place")(folder)
+    check_submission(read_submission(folder))
+
+
 DOCTORED_VARIANTS: dict[str, tuple[Callable[[Path], object], str]] = {
     "lower chance": (in_log(lambda log: [each.update(chance=0.0) for each in log]), "'chance': 0.0"),
     "no answer chosen": (in_log(lambda log: log[1].update(answered=False)), "answered"),
+    "choice of no variant": (of_task("put_only_the_butter", choice=9), r"'choice': \[None, 0, 1, 2"),
+    "a success that opened another drawer": (of_task("find_the_tomato_hidden", choice=0), r"'choice': \[1\]"),
+    "a success without an answer": (of_task("find_the_tomato_hidden", choice=None, answered=False), r"'choice': \[1\]"),
+    "a failure in the right bowl": (
+        of_task("put_the_butter_only", success=False, choice=0, answered=True),
+        r"'choice': \[None\]",
+    ),
+    "no answer of one variant": (
+        of_task("turn_the_stove_on_and_off_once", choice=None, answered=False),
+        r"'choice': \[0\]",
+    ),
     "a task less": (
         in_card(lambda card: card["protocol"].update(tasks=card["protocol"]["tasks"][1:])),
         "expected 12 to 36 episodes of each",
@@ -341,6 +383,15 @@ def test_partner_is_another_row_of_the_same_protocol(with_controls: Path, board:
     with pytest.raises(MemobenchError, match="'two', is no other row; known are 'one'"):
         check_partners([*others, read_submission(folder)])
     stating("without_memory", "one")(folder)
+    for change, reason in (
+        (in_card(lambda card: card["policy"]["settings"].update(memory="frames")), "the policy of one has a memory"),
+        (protocol(episodes=20), "differ in episodes: 10 and 20"),
+    ):
+        partner = shutil.copytree(board / "one", tmp_path / "partner" / "one")
+        change(partner)
+        with pytest.raises(MemobenchError, match=reason):
+            check_partners([read_submission(partner), read_submission(folder)])
+        shutil.rmtree(partner)
     protocol(replan_steps=10)(folder)
     with pytest.raises(MemobenchError, match="differ in replan_steps: 10 and 5"):
         check_partners([*others, read_submission(folder)])
@@ -410,7 +461,9 @@ def test_part_of_the_tasks_is_checked_and_not_submitted(
     card["protocol"].update(tasks=sorted(TASKS[:3]), episodes=3)
     card["task_files"] = {name: card["task_files"][name] for name in TASKS[:3]}
     write_evaluation(part, card)
-    assert main(["submit", "part", "--check"]) == 0
+    assert main(["submit", "part", "--check"]) == 2
+    assert "`memobench submit --supervised-with-answer` or" in capsys.readouterr().err
+    assert main(["submit", "part", "--check", "--no-supervised-with-answer"]) == 0
     assert "accepted: 9 rollouts of part; nothing is written" in capsys.readouterr().out
     assert [each.name for each in tmp_path.iterdir()] == ["part"]
     assert main(["submit", "part"]) == 2
@@ -419,7 +472,7 @@ def test_part_of_the_tasks_is_checked_and_not_submitted(
     assert main(["submit", "part", *words]) == 2
     assert "has 3 episodes of 3 of 30 tasks; expected 10 to 50 episodes of each" in capsys.readouterr().err
     (part / "episodes.jsonl").write_text(log_text(some[1:]))
-    assert main(["submit", "part", "--check"]) == 2
+    assert main(["submit", "part", "--check", "--no-supervised-with-answer"]) == 2
     assert "is missing in the log" in capsys.readouterr().err
 
 

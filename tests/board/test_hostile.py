@@ -5,6 +5,7 @@ Strict ones are made from a row without a simulation (`tests.support.board`), pu
 
 from __future__ import annotations
 
+import gzip
 import json
 import shutil
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from lerobot_memobench.board.submission import CARD, LOG, About, write_submissio
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.tasks.catalogue import get_task
-from tests.support.board import ABOUT, SALT, evaluation, in_card, in_log, scene_of, sealed, stating
+from tests.support.board import ABOUT, SALT, both, evaluation, in_card, in_log, scene_of, sealed, stating
 from tools.board.__main__ import main as check_board
 from tools.board.check import check_author, check_paths, check_submission, read_board
 from tools.board.page import board_rows
@@ -78,12 +79,22 @@ def features(kinds: dict[str, str]) -> Change:
     return in_card(lambda card: card["policy"]["settings"].update(input_features=made))
 
 
-def both(*changes: Change) -> Change:
-    return lambda folder: [change(folder) for change in changes]
-
-
 def protocol(**settings: Any) -> Change:
     return in_card(lambda card: card["protocol"].update(settings))
+
+
+def versions(**changed: Any) -> Change:
+    return in_card(lambda card: card["runs"][0]["versions"].update(changed))
+
+
+def in_pauses(**facts: Any) -> Change:
+    return lambda folder: in_card(lambda card: card["policy"].update(facts))(folder / "pauses")
+
+
+def server(folder: Path, path: str) -> None:
+    """Make the card one of a policy server, whose weights have no hash here."""
+    in_card(lambda card: (card["policy"].pop("sha256"), card["policy"].update(type="memobench_remote")))(folder)
+    in_card(lambda card: card.update(checkpoint={"path": path}))(folder)
 
 
 def drawn(salt: str | None) -> Callable[[Json], object]:
@@ -140,7 +151,27 @@ STRICT: dict[str, tuple[Change, str]] = {
         "equal for equal seeds only",
     ),
     "a hash of a version to come": (protocol(scene_hash_version=99), "scene_hash_version is 99"),
+    "other scenes of a local version": (
+        lambda folder: both(one(put(scene_hash="ab" * 8)), versions(mujoco="3.9.0+x"))(folder / "pauses"),
+        "equal for equal seeds only",
+    ),
+    # numbers that no log holds
+    "held longer than a rollout": (every(put(held_steps=10**9)), "found held_steps=1000000000"),
+    "holds left out": (every(lambda record: record.pop("held_steps")), "found held_steps=None"),
+    "over before it began": (one(put(wall_s=-1.0)), r"wall_s=-1\.0"),
+    "lines of another end": (
+        lambda folder: (folder / LOG).write_bytes(
+            gzip.compress(gzip.decompress((folder / LOG).read_bytes()).replace(b"\n", b"\r"))
+        ),
+        "line 1: it is not JSON",
+    ),
     # pauses
+    "pauses of another identity": (in_pauses(identity="act 123"), r"another policy \(identity differs"),
+    "pauses of another detector": (in_pauses(detector_sha256="f" * 64), r"another policy \(detector_sha256 differs"),
+    "pauses of other weights without a hash": (
+        lambda folder: [server(folder, "one"), server(folder / "pauses", "two")],
+        r"another policy \(checkpoint differs",
+    ),
     "more pauses than steps": (
         lambda folder: one(put(paused_steps=10**6))(folder / "pauses"),
         r"has \{'paused_steps': 1000000\}, expected",
@@ -162,12 +193,32 @@ STRICT: dict[str, tuple[Change, str]] = {
         "inputs are 'pixels'",
     ),
     "another checkpoint": (in_card(lambda card: card["policy"].update(sha256="3" * 64)), "the policy's sha256"),
+    "no checkpoint": (
+        in_card(lambda card: (card["policy"].pop("sha256"), card.update(checkpoint=None))),
+        "names no checkpoint of act",
+    ),
+    "longer plans than logged": (
+        in_card(lambda card: card["policy"]["settings"].update(n_action_steps=500)),
+        "the policy executes 500 actions per plan",
+    ),
+    "plans left out": (
+        both(protocol(replan_steps=None), in_card(lambda card: card["policy"]["settings"].pop("n_action_steps"))),
+        "no n_action_steps",
+    ),
+    "more frames than logged": (
+        in_card(lambda card: card["policy"]["settings"].update(n_obs_steps=30)),
+        "window_steps: 1 and 30",
+    ),
+    "a version left out": (
+        in_card(lambda card: card["runs"][0]["versions"].pop("lerobot_policy_memobench")),
+        "the card names lerobot_policy_memobench None",
+    ),
     "versions of other years": (
-        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "lerobot": "0.1.0"})),
+        versions(lerobot="0.1.0"),
         "the card names lerobot 0.1.0",
     ),
     "a version without a form": (
-        in_card(lambda card: card["runs"][0].update(versions={**card["runs"][0]["versions"], "mujoco": "not 3"})),
+        versions(mujoco="not 3"),
         "the card names mujoco not 3",
     ),
     # seeds

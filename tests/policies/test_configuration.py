@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 import lerobot_policy_memobench  # noqa: F401  (registers the environment)
-from lerobot_memobench.commands.command_line import recipe_file
+from lerobot_memobench.commands.command_line import parse_words, read_words, recipe_file
 from lerobot_memobench.errors import MemobenchError
+from lerobot_memobench.policies.checkpoint import SHIPPED
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import (
     ALIGN_TARGETS,
     SUPERVISED,
@@ -23,6 +25,7 @@ from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import
 )
 from lerobot_memobench.policies.memobench_mem.memory import OURS, mechanism_settings
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
+from lerobot_memobench.training.command import complete_training
 
 OBJECTS = {"size": "small", "perception": "objects"}
 
@@ -97,6 +100,25 @@ def test_policy_that_learns_from_the_answer_is_marked_for_good(
     torch.nn.Module.__init__(policy)
     policy.config = made
     assert (SUPERVISED in str(policy.generate_model_card("user/data", made.type, None, None))) is marked
+
+
+def test_training_from_a_marked_checkpoint_keeps_the_mark() -> None:
+    """The shipped policy learned by alignment; its file is older than the setting."""
+    source = SHIPPED / "memobench_strict"
+    assert "supervised_with_answer" not in json.loads((source / "config.json").read_text())
+
+    def asked(*words: str) -> Any:
+        words = (f"policy={words[0]}", "align=none", "device=cpu", *words[1:])
+        return complete_training(read_words("train", parse_words(words))).policy
+
+    assert asked(source.name).supervised_with_answer
+    assert not asked("memobench_strict_memoryless").supervised_with_answer
+    with pytest.raises(MemobenchError, match=r"follows from policy\.align"):
+        asked(source.name, "policy.supervised_with_answer=false")
+    later: Any = PreTrainedConfig.from_pretrained(source, cli_overrides=["--align=none", "--device=cpu"])
+    based = dataclasses.replace(later, base_weights=str(source))
+    assert MemobenchMemPolicy(based).config.supervised_with_answer, "as base weights"
+    assert MemobenchMemPolicy.from_pretrained(source, config=later, dataset_meta=object()).config.supervised_with_answer
 
 
 # -- refusals ------------------------------------------------------------------------------------------------------

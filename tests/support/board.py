@@ -29,6 +29,7 @@ ABOUT |= {"supervised_with_answer": False}
 VERSIONS = {"lerobot_policy_memobench": "0.2.0", "lerobot": "0.6.1", "mujoco": "3.9.0"}
 FILES = {"config.json": "1" * 64, "model.safetensors": "2" * 64}
 IMAGES = {"observation.images.image": {"type": "VISUAL", "shape": [3, 256, 256]}}
+SETTINGS = {"n_action_steps": 5, "input_features": IMAGES}
 SALT = "5" * 32
 
 
@@ -50,11 +51,11 @@ def line(name: str, episode: int, first: int, speed: int, **settings: Any) -> Js
     if settings.get("evidence"):
         scene, variant = scene_and_variant(published, episode)
         seed, task = first + scene, published.variant(variant)
-    success = episode % 3 > 0
+    success, only = episode % 3 > 0, len(published.random_variants) == 1
     steps = speed * len(task.checkpoints) + scene if success else 1200
     goals = [checkpoint.goal for checkpoint in task.checkpoints]
     marks = [speed * (k + 1) + scene if success or (k and goals[k] != task.goal) else None for k in range(len(goals))]
-    choice = {"choice": task.variant_index if success else None, "answered": success}
+    choice = {"choice": task.variant_index if success or only else None, "answered": success or only}
     choice |= {"variants": len(published.random_variants), "chance": chance(published)}
     return {
         **{"task": name, "memory_type": task.memory_type, "episode": episode, "seed": seed},
@@ -79,7 +80,7 @@ def evaluation(folder: Path, first: int = 7, speed: int = 50, suite: str = STRIC
     block = EnvSettings(suite=suite, seed_base=first, replan_steps=5, **settings).protocol_block
     content = card(
         {"tasks": sorted(names), "episodes": count, **block, "inputs": "pixels"},
-        {"type": "act", "seed": first, "settings": {"input_features": IMAGES}, "sha256": tree_hash(FILES)},
+        {"type": "act", "seed": first, "settings": SETTINGS, "sha256": tree_hash(FILES)},
         checkpoint={"path": "user/one", "revision": "abc", "files": FILES},
         trained_on={"repo_id": "user/data", "revision": "def"},
         task_files={name: task_hash(get_task(name)) for name in names},
@@ -113,6 +114,10 @@ def in_card(change: Callable[[Json], object]) -> Callable[[Path], None]:
         (folder / CARD).write_text(json.dumps(content))
 
     return apply
+
+
+def both(*changes: Callable[[Path], object]) -> Callable[[Path], object]:
+    return lambda folder: [change(folder) for change in changes]
 
 
 def stating(key: str, value: Any) -> Callable[[Path], None]:

@@ -11,8 +11,12 @@ import itertools
 import re
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+
+from packaging.version import Version
 
 from lerobot_memobench.board.rules import FEWEST, check_control, check_evaluation, supervised_with_answer
 from lerobot_memobench.board.submission import About
@@ -20,18 +24,19 @@ from lerobot_memobench.constants import EVIDENCE_EPISODES, MEMORY_POLICY, PROMPT
 from lerobot_memobench.envs.episode import referent_of
 from lerobot_memobench.envs.episode_log import evidence_line
 from lerobot_memobench.envs.evaluation_file import INPUTS, OF_ONE_EVALUATION, POLICY, differences
+from lerobot_memobench.envs.lerobot import EXECUTED, MemobenchEnvConfig
 from lerobot_memobench.envs.observations import DETECTIONS, NO_INPUT, PIXEL_INPUT, PRIVILEGED, READ_OBJECTS, SIMULATOR
-from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES
-from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES
+from lerobot_memobench.envs.pacing import STEPS_BETWEEN_PAUSES, longest
+from lerobot_memobench.envs.settings import OBJECTS, PIXELS, SCENE_HASHES, EnvSettings
 from lerobot_memobench.errors import MemobenchError, check_choice, nearest
 from lerobot_memobench.evaluation.metrics import failure_of, operations
 from lerobot_memobench.policies.checkpoint import tree_hash
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
 from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.rollouts.plan import SCRIPTED
-from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, scene_and_variant
+from lerobot_memobench.tasks.assessment import CUT_OFF, FAULTS, Choice, chance, scene_and_variant
 from lerobot_memobench.tasks.catalogue import get_task
-from lerobot_memobench.tasks.formula import And, Formula, Then, children, format_formula
+from lerobot_memobench.tasks.formula import And, Formula, Never, Then, atoms, children, format_formula, walk
 from lerobot_memobench.tasks.task import REFERENTS, STANDARD, STRICT, Task
 from tools.board.submission import Submission, Submitted, read_submission
 
@@ -67,10 +72,10 @@ def read_board(board: Path) -> list[Submission]:
 
 
 def check_partners(submissions: Sequence[Submission]) -> None:
-    """Check that each partner without a memory is another row of the board, with the same protocol.
+    """Check that each partner without a memory is another row of the board, of the same protocol, tasks and episodes.
 
     Raises:
-        MemobenchError: one is not.
+        MemobenchError: one is not, or its settings name a memory.
     """
     protocols = {submission.name: submission.evaluation.protocol for submission in submissions}
     for submission in submissions:
@@ -82,11 +87,18 @@ def check_partners(submissions: Sequence[Submission]) -> None:
             raise MemobenchError(
                 f"{mine}: the partner without a memory, {partner!r}, is no other row; {nearest(partner, others)}"
             )
-        if unlike := differences(protocols[mine], protocols[partner], ignore=OF_ONE_EVALUATION):
+        if remembers(_block(protocols[partner][POLICY].get("settings"))):
+            raise MemobenchError(f"{mine}: the policy of {partner} has a memory; name the row of a partner without one")
+        if unlike := differences(protocols[mine], protocols[partner], extent=True, ignore=OF_ONE_EVALUATION):
             raise MemobenchError(
                 f"{mine} and its partner without a memory, {partner}, differ in {unlike[0]}; evaluate both with the "
                 "same settings"
             )
+
+
+def remembers(settings: Mapping[str, Any]) -> bool:
+    """Return whether the settings of a policy name a memory."""
+    return bool(settings.get("use_visual_memory")) or settings.get("memory") not in (None, False, NONE)
 
 
 def check_paths(changed: Iterable[str], board: str = "results/board") -> str | None:
@@ -157,8 +169,12 @@ def check_submission(submission: Submission, others: Sequence[Submission] = ()) 
 def _check_log(run: Submitted) -> None:
     _check_inputs(run)
     _check_policy(run)
+    most, absent = longest(_check_plan(run)), None if run.protocol["suite"] == STRICT else 0
     for record in run.records:
         _check_record(run, record)
+        held, wall = record.get("held_steps", absent), record.get("wall_s") or 0
+        if held is None or not 0 <= held <= most or wall < 0:
+            raise MemobenchError(f"{run.folder}: found held_steps={held} and wall_s={wall}; submit the log unchanged")
     if (problem := first_variant_mismatch(run.records)) is not None:
         raise MemobenchError(f"{run.folder}: another version drew the variants ({problem}); evaluate with this version")
 
@@ -245,10 +261,46 @@ def _check_control_fields(where: str, protocol: Mapping[str, Any], record: Mappi
     if protocol["evidence"]:
         choice = record.get("choice")
         answered = choice is not None or record.get("answered", False)
+        choices = _choices(record["task"], record["variant"], record["success"], record.get("lost", False))
         expected |= evidence_line(get_task(record["task"]), choice, answered)
+        expected |= {} if choice in choices else {"choice": choices}
     logged = {key: record[key] for key in CONTROL_FIELDS if key in record}
     if logged != expected:
         raise MemobenchError(f"{where} has {logged}, expected {expected}; submit the log of this control unchanged")
+
+
+@cache
+def _choices(name: str, variant: int, success: bool, lost: bool) -> Sequence[int | None]:
+    """Return the variants that a rollout of a task with this end can have acted on; None for none of them."""
+    task = get_task(name).variant(variant)
+    fitting = Choice(task).fitting
+    if len(fitting) == 1:
+        return [variant]
+    others = {k: order for k, order in fitting.items() if k != variant}
+    forbidden = {atom for part in walk(task.goal) if isinstance(part, Never) for atom in atoms(part)}
+    # Either all variants handle the same, and the first goal to become true decides, or the goal forbids to handle what
+    # the others begin with. Elsewhere a success proves nothing: an object lifted by mistake may be put back.
+    by_goal = all(order == fitting[variant] for order in others.values())
+    decided = by_goal or {order[0] for order in others.values()} <= forbidden
+    if task.suite != STRICT or chance(task) is None or not decided:
+        return [None, *fitting]
+    return [variant] if success else [None, *(others if lost else ()), *(() if by_goal else (variant,))]
+
+
+def _check_plan(run: Submitted) -> EnvSettings:
+    """Check that the intervals of plans are those that the policy's settings give, and return the run's settings."""
+    kind, of_environment = run.card[POLICY].get("type"), EnvSettings.__dataclass_fields__
+    policy = SimpleNamespace(**{**_block(run.card[POLICY].get("settings")), "type": kind})
+    own = MemobenchEnvConfig(**{key: value for key, value in run.protocol.items() if key in of_environment})
+    of_kind = getattr(_trained_class(kind), "__dataclass_fields__", {})
+    problems = [f"no {name}" for name in EXECUTED if name in of_kind and not isinstance(vars(policy).get(name), int)]
+    try:
+        problems += differences(vars(own.settings), vars(own.settings_for(policy)), ignore=["prompt_in"])
+    except Exception as error:  # a card may hold any values
+        problems.append(" ".join(str(error).split()))
+    if problems:
+        raise MemobenchError(f"{run.folder}: its plans are not its policy's ({problems[0]}); submit the card unchanged")
+    return own.settings
 
 
 def _check_inputs(run: Submitted) -> None:
@@ -263,7 +315,8 @@ def _check_inputs(run: Submitted) -> None:
     detector = settings.get("detector")
     drawn = {PIXEL_INPUT, DETECTIONS} if obs_type != OBJECTS and (types != {"ENV"} or detector is not None) else set()
     objects = {PRIVILEGED} if obs_type != PIXELS and types != {"VISUAL"} else set()
-    reads = settings["perception"] == OBJECTS_READ if "perception" in settings else not _ignores_objects(kind)
+    ignored = _trained_class(kind) is not None and kind not in (*READ_OBJECTS, MEMORY_POLICY)
+    reads = settings["perception"] == OBJECTS_READ if "perception" in settings else not ignored
     needed = objects if reads and "ENV" in types and detector is None else set()
     asked = _block(run.card.get("settings", {}).get("env"))
     if kind in SCRIPTED or asked.get("expert_action") or asked.get("blind_action"):
@@ -275,12 +328,13 @@ def _check_inputs(run: Submitted) -> None:
         )
 
 
-def _ignores_objects(kind: str) -> bool:
+def _trained_class(kind: str | None) -> type | None:
+    """Return the configuration class of a policy of LeRobot or of `memobench_mem`, which have weights; else None."""
     import lerobot.policies  # noqa: F401 - registers the types
     from lerobot.configs.policies import PreTrainedConfig
 
     config = PreTrainedConfig.get_known_choices().get(kind)
-    return config is not None and config.__module__.startswith("lerobot.") and kind not in READ_OBJECTS
+    return config if kind == MEMORY_POLICY or str(getattr(config, "__module__", "")).startswith("lerobot.") else None
 
 
 def _block(value: Any) -> Mapping[str, Any]:
@@ -291,9 +345,11 @@ def _check_mark(run: Submitted, about: About) -> None:
     """Check that the mark of supervision with the answer is there, and agrees with the alignment and the memory."""
     marked, policy = supervised_with_answer(run, about), run.card[POLICY]
     decisive: Any = {name: str(_block(policy.get("settings")).get(name)) for name in DECISIVE}
-    if policy.get("type") != MEMORY_POLICY or decisive["memory"] not in (NONE, *OURS, str(None)):  # or of a plugin
+    if policy.get("type") != MEMORY_POLICY:
         return
-    if MemobenchMemConfig(device="cpu", **decisive).supervised_with_answer and not marked:
+    plugin = decisive["memory"] not in (NONE, *OURS, str(None))  # it is not here: the alignment alone decides
+    known = decisive | ({"memory": MemobenchMemConfig.memory} if plugin else {})
+    if MemobenchMemConfig(device="cpu", **known).supervised_with_answer and not marked:
         raise MemobenchError(
             f"{run.folder}: supervised_with_answer is false on the card of a policy with {decisive}; submit the card "
             "unchanged"
@@ -307,6 +363,8 @@ def _check_policy(run: Submitted) -> None:
             f"{run.folder}: the policy's sha256 {str(there)[:12]} is not that of the checkpoint's files on the card; "
             "submit the card unchanged"
         )
+    if there is None and _trained_class(kind := run.card[POLICY].get("type")) is not None:
+        raise MemobenchError(f"{run.folder}: the card names no checkpoint of {kind}; evaluate a trained policy")
 
 
 def _check_scenes(runs: Sequence[Submitted]) -> None:
@@ -323,7 +381,7 @@ def _check_scenes(runs: Sequence[Submitted]) -> None:
                 f"{run.folder}: {SCENE_HASHES} is {version}; expected at most {SCENE_HASH_VERSION}, that of this "
                 "version"
             )
-        simulator = run.card["runs"][-1]["versions"].get("mujoco"), version
+        simulator = Version(Version(run.card["runs"][-1]["versions"]["mujoco"]).base_version), version
         for record in run.records:
             kind = (*simulator, *record.get("stand_ins", ()), record["task"])
             scene, seed = str(record.get("scene_hash")), record["seed"]

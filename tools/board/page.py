@@ -22,7 +22,7 @@ from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, stand
 from lerobot_memobench.evaluation.statistics import Contrast
 from lerobot_memobench.evaluation.tables import NOT_APPLICABLE, percent_text, with_interval
 from lerobot_memobench.untrusted import checked, parsed
-from tools.board.check import RERUNS, ranked, read_board
+from tools.board.check import RERUNS, ranked, read_board, remembers
 from tools.board.submission import Submission
 
 
@@ -103,8 +103,7 @@ def board_row(
 
 def memory_stride(settings: Mapping[str, Any]) -> int | None:
     """Return the control steps between updates of a policy's memory; None without a memory, or if they are unknown."""
-    remembers = settings.get("use_visual_memory") or settings.get("memory") not in (None, "none")
-    stride = settings.get("memory_stride") if remembers else None
+    stride = settings.get("memory_stride") if remembers(settings) else None
     return stride if isinstance(stride, int) else None  # a card may hold any value
 
 

@@ -138,7 +138,7 @@ def _unpacked(file: Path) -> bytes:
 
 def _lines(file: Path, content: bytes) -> Iterator[Mapping[str, Any]]:
     known = set()
-    for number, line in enumerate(content.splitlines(), start=1):
+    for number, line in enumerate(content.removesuffix(b"\n").split(b"\n"), start=1):
         try:
             record = checked(parsed(line), EpisodeRecord)
             json.loads(line, object_pairs_hook=_once)

@@ -11,7 +11,8 @@ from importlib import metadata
 from typing import Any
 
 from packaging.requirements import Requirement
-from packaging.version import InvalidVersion
+from packaging.specifiers import SpecifierSet
+from packaging.version import InvalidVersion, Version
 
 from lerobot_memobench.board.submission import PAUSES, About
 from lerobot_memobench.constants import EVALUATION_EPISODES, EVIDENCE_EPISODES, MEMORY_POLICY, PAPER, SEALED, SPLITS
@@ -68,9 +69,14 @@ def supervised_with_answer(run: Run, about: About) -> bool | None:
     policy = run.card[POLICY]
     if policy.get("type") in SCRIPTED:
         return None
-    marked = about.supervised_with_answer
+    marked = stated = about.supervised_with_answer
     if policy.get("type") == MEMORY_POLICY:
         marked = policy.get("settings", {}).get("supervised_with_answer")
+    if isinstance(marked, bool) and stated not in (None, marked):
+        raise MemobenchError(
+            f"{run.folder}: the policy has supervised_with_answer={marked}, and {stated} is stated; leave the option "
+            f"of `memobench submit` out for {MEMORY_POLICY}"
+        )
     if not isinstance(marked, bool):
         raise MemobenchError(
             f"{run.folder}: found no statement whether the policy was supervised with the answer; expected the setting "
@@ -83,14 +89,21 @@ def supervised_with_answer(run: Run, about: About) -> bool | None:
 def check_control(run: Run, control: Run, name: str, *, part: bool = False) -> None:
     """Check an evaluation under a control as `check_evaluation` does, and that policy and settings are the same."""
     check_evaluation(control, part=part, control=name)
-    for key in ("type", "sha256", "settings"):
-        of_run, of_control = (evaluation.card[POLICY].get(key) for evaluation in (run, control))
-        if of_run != of_control:
+    facts, others = _policy_facts(run), _policy_facts(control)
+    for key in facts:
+        if facts[key] != others[key]:
             raise MemobenchError(f"{control.folder} is of another policy ({key} differs); evaluate the same checkpoint")
     if unlike := differences(run.protocol, control.protocol, ignore={*CONTROL_SETTING[name], "salt"}):
         raise MemobenchError(
             f"{run.folder} and {control.folder} differ in {unlike[0]}; evaluate with the same settings"
         )
+
+
+def _policy_facts(run: Run) -> dict[str, Any]:
+    policy = run.card[POLICY]
+    facts = {key: policy.get(key) for key in ("type", "identity", "sha256", "detector_sha256", "settings")}
+    # Of equal hashes the place may differ.
+    return facts | {"checkpoint": None if facts["sha256"] else run.card.get("checkpoint")}
 
 
 def _check_settings(run: Run, **control: Any) -> None:
@@ -154,12 +167,13 @@ def _check_versions(run: Run, names: Sequence[str]) -> None:
             )
         (version,) = versions
         try:
-            fits = package not in REQUIRED or REQUIRED[package].contains(version, prereleases=True)
+            Version(version)  # also of this package, which requires none of its own
+            fits = REQUIRED.get(package, SpecifierSet()).contains(version, prereleases=True)
         except InvalidVersion:
             fits = False
         if not fits:
             raise MemobenchError(
-                f"{run.folder}: the card names {package} {version[:20]}; expected {package}{REQUIRED[package]}"
+                f"{run.folder}: the card names {package} {version[:20]}; expected {package}{REQUIRED.get(package, '')}"
             )
     for name in names:
         here, stored = task_hash(get_task(name)), run.card["task_files"].get(name)

@@ -210,9 +210,9 @@ def submit(
     rules.check_evaluation(evaluation, part=check)
     if pauses:
         rules.check_control(evaluation, own_evaluation(pauses), PAUSES, part=check)
+    rules.supervised_with_answer(evaluation, about)
     if check:
         return say(f"accepted: {count_of(len(evaluation.records), 'rollout')} of {card}; nothing is written")
-    rules.supervised_with_answer(evaluation, about)
     write_submission(out / name, about, {"": card, **({PAUSES: pauses} if pauses else {})})
     say(f"accepted: {out / name}")
     say(f"text of the pull request: {write_file(out / f'{name}.md', pull_request(name, about, evaluation))}")

@@ -106,6 +106,11 @@ class Choice:
         self._first = next((k for k, now in zip(self._variants.values(), reached, strict=True) if now), None)
 
     @property
+    def fitting(self) -> dict[int, list[Atom]]:
+        """Variants that still fit, each with the atoms of `handled_atoms`; before the first step all candidates."""
+        return self._fitting
+
+    @property
     def answered(self) -> bool:
         """Whether an answer was given, including answers that fit no variant."""
         return self.variant is not None or not self._fitting

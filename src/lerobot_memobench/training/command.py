@@ -174,6 +174,11 @@ def complete_training(requested: CommandSettings, notify: Callable[[str], None] 
     policy: Any = config.policy
     if getattr(policy, "type", None) == MEMORY_POLICY:
         check_settings(config)
+        if "policy.supervised_with_answer" in requested.words:
+            raise MemobenchError(
+                "policy.supervised_with_answer follows from policy.align, policy.memory and the checkpoint that the "
+                "training starts from, and cannot be set; leave it out"
+            )
     check_with_lerobot(config, requested)
     if config.checkpoint_path is not None:
         check_same_training(requested, config, config.checkpoint_path, notify)
@@ -186,8 +191,10 @@ def complete_training(requested: CommandSettings, notify: Callable[[str], None] 
         mechanism_settings(memory, value_of("policy.memory_settings", dict[str, Any], given))
     if path is not None:
         with quiet():
-            trained = as_trained(path, policy)
+            trained: Any = as_trained(path, policy)
             check_weights(path, trained)
+        if getattr(trained, "supervised_with_answer", False):  # also where the checkpoint's file lacks it
+            policy.supervised_with_answer = True
         changed = list(differing(policy, trained, getattr(policy, "fixed_by_training", ())))
         if changed:
             was, now = (", ".join(f"{item[0]}={item[part]}" for item in changed) for part in (2, 1))

@@ -14,14 +14,17 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from lerobot_memobench.constants import MEMORY_POLICY
 from lerobot_memobench.errors import MemobenchError
 from lerobot_memobench.policies.checkpoint import (
+    CONFIG_FILE,
     PREPROCESSOR_FILE,
     WEIGHTS_FILE,
     check_processors,
     checkpoint_file,
     differing,
     processor_steps,
+    read_checkpoint_json,
     undamaged_tensors,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import MemobenchMemConfig
@@ -100,6 +103,14 @@ def load_base_weights(model: MemoryPI05, weights: dict[str, Tensor], source: str
     if _HEAD in placed:
         placed.setdefault(_EMBEDDING, placed[_HEAD])
     load_exactly(model, placed, source, optional=set(model.memory_parameters()))
+
+
+def learned_from_answer(source: str) -> bool:
+    """Return whether weights are those of a `memobench_mem` that was supervised with the answer."""
+    file = checkpoint_file(source, CONFIG_FILE)
+    if file is None or read_checkpoint_json(file).get("type") != MEMORY_POLICY:
+        return False
+    return read_config(source, None, None).supervised_with_answer
 
 
 # -- files ------------------------------------------------------------------------------------------------------------

@@ -215,8 +215,8 @@ class MemobenchMemConfig(PreTrainedConfig):
     repository of a SigLIP model; None: the default of the size."""
     supervised_with_answer: bool = False
     """Mark of a policy that learned from texts which name the hidden answer: by an alignment, except with
-    ``align_targets=progress``, or by a memory that learns from texts. Construction sets it, and a training that starts
-    from such a checkpoint keeps it."""
+    ``align_targets=progress``, or by a memory that learns from texts. It follows from these settings and cannot be set
+    in a command; a training that starts from such a checkpoint keeps it."""
 
     # -- memory
     memory: str = "frames"

@@ -30,6 +30,7 @@ from lerobot_memobench.policies.checkpoint import (
 from lerobot_memobench.policies.compatibility import hint
 from lerobot_memobench.policies.memobench_mem.checkpoints import (
     has_another_memory,
+    learned_from_answer,
     load_base_weights,
     load_weights,
     read_config,
@@ -120,6 +121,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
             self.precision.settle()  # before loading weights, which may be float32
         if config.base_weights and load_base:
             load_base_weights(self.model, read_tensors(weights_file(config.base_weights)), config.base_weights)
+            config.supervised_with_answer |= learned_from_answer(config.base_weights)
         elif isinstance(self.perception, VisualTokenEncoder) and load_base:
             assert config.visual_encoder is not None
             self.perception.tower.load_state_dict(load_visual_encoder(config.visual_encoder).state_dict())
@@ -484,6 +486,7 @@ class MemobenchMemPolicy(PreTrainedPolicy):
                 check_as_trained(saved, config, of)
         trained = as_trained(source, config, revision)
         assert isinstance(trained, MemobenchMemConfig)
+        config.supervised_with_answer |= trained.supervised_with_answer  # what was learned stays learned
         policy = cls(config, dataset_meta=dataset_meta, load_base=False, draw=has_another_memory(config, trained))
         load_weights(policy, path, source, trained)
         policy.to(config.device)
