@@ -215,6 +215,7 @@ def problems_of_study(page: Path = STUDY, kept: Path = EVALUATIONS) -> list[str]
         f"{page.name}: {' | '.join(row)} is in no table of research.memory_study"
         for head, rows in tables(page)
         for row in rows
+        if not head[0]  # as the program's
         if not any(dict(zip(head, row, strict=True)).items() <= each.items() for each in known)
     ]
 
