@@ -165,6 +165,7 @@ def test_published_figures_are_those_of_their_sources(page: Path) -> None:
 
 
 def test_rows_of_the_study_are_rows_of_its_program(tmp_path: Path) -> None:
+    assert recompute.problems_of_study() == []
     page, head = tmp_path / "study.md", "| | training seeds | SR |\n|---|---|---|\n"
     page.write_text(f"{head}| ceiling without a memory | – | 33.7 |\n| no memory | 3 | **90.0** |\n")
     (problem,) = recompute.problems_of_study(page)

