@@ -8,8 +8,8 @@
 All parts are built and checked before the first is uploaded. The dry run gives the commands of an upload the addresses
 of two local servers, then installs the wheel by its name in an empty environment and evaluates there. An upload refuses
 uncommitted changes, a part that is not at hand, and a version if the index has another wheel of it. The same command
-continues an interrupted upload: index and hub skip files whose hash they have. The last lines are what is left to do by
-hand. The site becomes a static Space, because no workflow publishes it.
+continues an interrupted upload: index and hub skip files whose hash they have. The last lines
+are the remaining manual steps. The site becomes a static Space, because no workflow publishes it.
 """
 
 from __future__ import annotations
@@ -201,7 +201,7 @@ def try_installed(index: str, policies: Sequence[str], environment: Mapping[str,
 
 
 def left(parts: Mapping[str, Part], user: str, uploaded: bool = False) -> str:
-    """Return what is left to do by hand, in the order in which a person does it."""
+    """Return the remaining manual steps, in order."""
     upload = f"""\
 - Upload. Not seen yet: whether the index grants the name, how the hub stores files and shows its pages.
 

@@ -1,4 +1,4 @@
-"""Run a row of the board anew with this version: ``python scripts/renew_row.py results/board/NAME OUT``.
+"""Run a row of the board again with this version: ``python scripts/renew_row.py results/board/NAME OUT``.
 
 The evaluation and its controls run with the settings of the row's cards into OUT/NAME; the same command resumes them.
 Then they replace the row. ``python -m tools.board results/board`` checks the board;

@@ -253,8 +253,8 @@ def results(name: str, rollouts: Path) -> list[str]:
     return ["", f"`{command}`, sha256 of its log `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
 
 
-def retell(name: str, rollouts: Path) -> Path:
-    """Put another evaluation of the same weights into the card of the package's policy ``name``; return its folder."""
+def replace_results(name: str, rollouts: Path) -> Path:
+    """Replace the results on the card of the package's policy ``name``; return its folder."""
     file = SHIPPED / name / "README.md"
     before, _, _ = file.read_text().partition("\n`lerobot eval env=memobench ")
     write_file(file, "\n".join([before, *results(name, rollouts)[1:]]) + "\n")
@@ -282,6 +282,6 @@ if __name__ == "__main__":
     given = parser.parse_args()
     parts = {whole: parts for whole, *parts in given.merged}
     if str(given.run) == given.name and given.rollouts is not None:
-        print(retell(given.name, given.rollouts))
+        print(replace_results(given.name, given.rollouts))
     else:
         print(ship(given.run, given.name, given.rollouts, parts))

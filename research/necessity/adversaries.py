@@ -54,8 +54,8 @@ HOVER = 0.04
 """Height above home at which a hand waits for the clock without being away, m."""
 REST = 45
 """Control steps at home that end the count."""
-BESIDE, NEAR = 0.09, 0.027
-"""Distances from home at which a hand turns to its side, and waits beside home for its plan, m."""
+ASIDE, NEAR = 0.09, 0.027
+"""Distances from home at which a hand turns to its side, and waits near home for its plan, m."""
 SIDES = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.3], [1.0, 0.0, 0.6], [0.0, -1.0, 0.3]])
 """Directions (4, 3) from which a hand comes home after one, two, three and four events."""
 HAND_POSE = 0.002
@@ -345,11 +345,11 @@ def past_home(seat: Seat) -> Motion:
 
 
 def come_from(seat: Seat, number: int, plan_begins: Callable[[], bool]) -> Motion:
-    """Wait beside home, on the side of ``number`` events, until a plan begins; then come home."""
+    """Wait near home, on the side of ``number`` events, until a plan begins; then come home."""
     hand, (home, turn) = seat.expert.hand, seat.sim.home
     side = directions()[number - 1]
     yield from rise(hand, OPEN, 0.2)
-    yield from hand.move(home + BESIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
+    yield from hand.move(home + ASIDE * side, turn, OPEN, tolerance=0.012, turn_tolerance=0.04, timeout=120)
     yield from hand.move(home + NEAR * side, turn, OPEN, tolerance=0.004, turn_tolerance=0.04, timeout=60)
     while not plan_begins():
         yield hand.toward(home + NEAR * side, turn, OPEN)

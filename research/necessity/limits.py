@@ -43,7 +43,7 @@ from research.necessity.adversaries import (
 from research.necessity.clock import EVENT_STEPS
 
 PLAN, CUT = 10, {1: 5, 2: 3}
-"""Declared actions of a plan; past events -> actions of a plan that is cut short beside home."""
+"""Declared actions of a plan; past events -> actions of a plan that is cut short near home."""
 EVENTS_BY_INDEX = {0: 0, PLAN - 5: 1, PLAN - 8: 2}
 """Index of the first action with an effect in its plan -> past events: holds end at multiples of `PLAN`."""
 UNDECLARED = 400
@@ -71,7 +71,7 @@ def after_public_holds(seat: Seat, events: int) -> NDArray[np.floating]:
 
 
 def by_phase_of_plans(seat: Seat) -> Motion:
-    """Begin plans early beside home; the phase of later plans counts the events."""
+    """Begin plans early near home; the phase of later plans counts the events."""
     events = seat.events()
     while (done := EVENTS_BY_INDEX.get(seat.elapsed - _present_plan(seat)[0], 0)) < len(events):
         yield from bring(seat, *events[done])
@@ -86,15 +86,15 @@ def _present_plan(seat: Seat) -> tuple[int, int]:
     first = 0
     while True:
         frame = seat.frames[first]
-        beside = abs(float(np.linalg.norm(frame)) - NEAR) < 0.005
-        length = CUT.get(1 + int(np.argmax(directions() @ frame)), PLAN) if beside else PLAN
+        close = abs(float(np.linalg.norm(frame)) - NEAR) < 0.005
+        length = CUT.get(1 + int(np.argmax(directions() @ frame)), PLAN) if close else PLAN
         if first + length > seat.elapsed:
             return first, length
         first += length
 
 
 def by_undeclared_plan(seat: Seat) -> Motion:
-    """Come home within a plan that began beside home; if the plan goes on after the hold, the event is done."""
+    """Come home within a plan that began near home; if the plan goes on after the hold, the event is done."""
     first, *others = seat.events()
     while np.linalg.norm(seat.frames[seat.elapsed - seat.elapsed % UNDECLARED]) <= HAND_POSE:
         yield from bring(seat, *first)

@@ -23,7 +23,7 @@ def test_the_phase_of_plans_counts_the_cut_plans() -> None:
     home = np.zeros(3)
     for events in CUT:
         seat.frames.extend([home] * (PLAN - len(seat.frames) % PLAN) if events == 1 else [])
-        while _present_plan(seat)[0] != seat.elapsed:  # stand beside home when a plan begins
+        while _present_plan(seat)[0] != seat.elapsed:  # stand near home when a plan begins
             seat.frames.append(home)
         seat.frames[-1] = NEAR * directions()[events - 1]
         seat.frames.extend([home] * (2 * PLAN))

@@ -141,7 +141,7 @@ def caches() -> Finding:
 
 
 def assets() -> Finding:
-    """Find LIBERO's assets, of which every scene is made; name the places that are not used."""
+    """Find LIBERO's assets, which every scene needs; name the places that are not used."""
     place, unused = find_assets()
     if place is None:
         return Finding("assets", "failed", f"LIBERO's assets are not on this machine{unused}", OBTAIN)

@@ -156,7 +156,7 @@ def assets(
         Path | None, typer.Option(help="Copy the files into this folder, for a machine without a network.")
     ] = None,
 ) -> None:
-    """Find LIBERO's assets, of which the scenes are made. They are downloaded from the Hugging Face hub if this machine
+    """Find LIBERO's assets, which the scenes need. They are downloaded from the Hugging Face hub if this machine
     has no complete copy.
     """
     from lerobot_memobench.sim.files import ASSETS_VARIABLE, TERMS, copy_to, obtain

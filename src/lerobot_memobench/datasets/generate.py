@@ -206,7 +206,7 @@ def run_size(frames: int, image_size: int | None, held_frames: int = 0) -> int:
 
 
 def check_room(out: Path, size: int, staged: int, notify: Callable[[str], None], work: str, extra: int = 0) -> None:
-    """Report the disk space that a run needs, and refuse a run of which not even one copy has room.
+    """Report the disk space that a run needs, and refuse a run if one copy of the dataset has no room.
 
     ``size`` is the dataset's, ``staged`` of it exists already, ``extra`` is that of temporary files, all in bytes;
     ``work`` begins the message.

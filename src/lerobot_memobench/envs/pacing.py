@@ -83,8 +83,8 @@ class Pacing:
 def shortest_hold(settings: EnvSettings) -> int:
     """Return the minimum number of control steps of a hold.
 
-    A plan of K actions that begins d steps after its observation, made from a window of W steps of which the last
-    before home is the first, acts until step W + d + K − 3 after the arrival.
+    A plan of K actions begins d steps after its observation and is made from a window of W steps. If the first step of
+    the window is the last before home, the plan acts until step W + d + K − 3 after the arrival.
     """
     length = (settings.replan_steps or 1) * steps_per_action(settings.speed)
     return settings.window_steps + settings.delay_steps + length - 1

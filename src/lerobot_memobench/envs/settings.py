@@ -99,8 +99,8 @@ class EnvSettings:
 
     suite: str = setting(
         PUBLISHED,
-        "thirty tasks as published; strict: variants that need a memory; libero_…: LIBERO's own tasks, of which "
-        "episode i has the i-th initial state",
+        "thirty tasks as published; strict: variants that need a memory; libero_…: LIBERO's own tasks, "
+        "episode i from the i-th initial state",
         (*SUITES, *LIBERO_SUITES),
     )
     difficulty: str = setting(

@@ -151,7 +151,7 @@ def complete_statistics(policy: Any, meta: LeRobotDatasetMetadata, config: Any) 
 
 
 def downloaded(config: DatasetConfig, meta: LeRobotDatasetMetadata) -> Path:
-    """Return the folder of a dataset with its data, of which the metadata may be here alone."""
+    """Return the folder of a dataset; download its data if only its metadata is here."""
     root = Path(meta.root)
     if (root / "data").is_dir():
         return root

@@ -76,7 +76,7 @@ from lerobot_memobench.training.features import cameras_of
 logger = logging.getLogger(__name__)
 
 SOURCE_EPISODE = "source_episode_index"
-"""Column of a view's episodes: the dataset's episode of which each is a part."""
+"""Column of a view's episodes: the dataset's episode that each is a part of."""
 
 
 def prepare(

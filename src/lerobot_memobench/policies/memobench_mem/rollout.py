@@ -82,7 +82,7 @@ class EnvMemory:
 
 
 class Rollout:
-    """The environments of a vector environment, of which every ``stride``-th frame is written, if any (``remembers``).
+    """The environments of a vector environment; every ``stride``-th frame is written, or none if not ``remembers``.
 
     An episode's first frame is always written. If observations have no clock, each observation is a control step.
     """
