@@ -74,7 +74,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Grid:
-    """All rows and suites, and their shared words."""
+    """All rows and suites, and their shared words.
+
+    Attributes:
+        contrasts: name of a family -> pairs of a row and its reference; Holm's adjustment is within a family.
+    """
 
     policy: list[str]
     training: list[str]
@@ -83,6 +87,7 @@ class Grid:
     rows: dict[str, Row]
     controls: dict[str, list[str]] = field(default_factory=dict)
     sealed: list[str] = field(default_factory=list)
+    contrasts: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.rows or not self.suites:
@@ -103,6 +108,9 @@ class Grid:
             self._check_suite(name, suite)
         for name, row in self.rows.items():
             self._check_row(name, row)
+        for row in (row for pairs in self.contrasts.values() for pair in pairs for row in pair):
+            if row not in self.rows:
+                raise MemobenchError(f"contrasts name the row {row!r}; {nearest(row, self.rows)}")
 
     def _check_suite(self, name: str, suite: Suite) -> None:
         words = suite.demonstrations

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from statistics import mean
@@ -20,8 +20,6 @@ from research.memory_study.cells import Cell, difference
 from research.memory_study.contrasts import SeedContrast, adjusted, average_success, contrast, episodes_of
 from research.memory_study.grid import ROLLOUTS, SEALED, TRAINING, Grid
 
-REFERENCES = ("no memory", "clock of the execution", "frames", "contrastive")
-"""Rows from which the differences of the others are computed."""
 EVIDENCE = "evidence"
 """The control with columns in the first table; the others have a table of their own."""
 CEILING = "ceiling without a memory"
@@ -46,10 +44,10 @@ def tables(grid: Grid, out: Path, suite: str) -> str:
         ("Success by task", _by_task(rows, grid.suites[suite].ceilings)),
         ("How rollouts ended, all training seeds together", _endings(rows)),
         ("Other conditions of the rollouts, last training seed", _conditions(rows)),
-        *((f"Minus *{name}*, by the training seeds that both have", _differences(rows, name)) for name in REFERENCES),
+        *_differences(grid, rows, ROLLOUTS),
         (f"Minus *{CEILING}*", _above_ceiling(rows, grid.suites[suite].ceilings)),
         ("The sealed test", _sealed(rows)),
-        *((f"The sealed test, minus *{name}*", _differences(rows, name, SEALED)) for name in REFERENCES),
+        *_differences(grid, rows, SEALED),
         ("Cost of a cell, on a shared machine", _costs(rows)),
     ]
     return "\n\n".join([f"## {suite}", *(f"### {title}\n\n{table}" for title, table in parts if table)])
@@ -283,26 +281,28 @@ def _above_ceiling(rows: Rows, ceilings: Mapping[str, float]) -> str:
     return table_of(("", "training seeds", "difference, points", "95 %"), lines)
 
 
-def _differences(rows: Rows, reference: str, part: str = ROLLOUTS) -> str:
-    base = {cell.seed: cell for cell in rows.get(reference, ()) if evaluated(cell, part)}
-    found = {}
-    for row, own in rows.items():
-        shared = [cell for cell in own if cell.seed in base and evaluated(cell, part)]
-        if row != reference and shared:
-            others = [base[cell.seed] for cell in shared]
-            found[row] = contrast(_runs(shared, part), _runs(others, part), row, reference)
-    return _contrasts_table(adjusted(found), reference) if found else ""
+def _differences(grid: Grid, rows: Rows, part: str) -> Iterator[tuple[str, str]]:
+    """Yield a title and a table of each family of contrasts, by the training seeds that both rows have."""
+    for family, pairs in grid.contrasts.items():
+        found = {}
+        for row, reference in pairs:
+            base = {cell.seed: cell for cell in rows.get(reference, ()) if evaluated(cell, part)}
+            if shared := [cell for cell in rows.get(row, ()) if cell.seed in base and evaluated(cell, part)]:
+                others = [base[cell.seed] for cell in shared]
+                found[f"{row} minus {reference}"] = contrast(_runs(shared, part), _runs(others, part), row, reference)
+        if found:
+            yield f"Contrasts, {family}, {part}", _contrasts_table(adjusted(found))
 
 
-def _contrasts_table(found: Mapping[str, SeedContrast], reference: str) -> str:
+def _contrasts_table(found: Mapping[str, SeedContrast]) -> str:
     lines = [
         [
-            f"{name} minus {reference}",
+            name,
             str(each.episodes),
-            f"{100 * each.value:+.1f}",
+            f"{100 * each.value:+z.1f}",
             f"{100 * each.low:+.1f} to {100 * each.high:+.1f}",
             _probability(each.p),
-            ", ".join(f"{100 * value:+.0f}" for value in each.of_seeds),
+            ", ".join(f"{100 * value:+z.0f}" for value in each.of_seeds),
             _probability(each.p_of_seeds),
             EMPTY if each.detectable is None else f"{100 * each.detectable:.1f}",
         ]

@@ -38,6 +38,7 @@ controls: {evidence: [evidence=true, episodes=12]}
 rows:
   no memory: {training: [policy.memory=none], seeds: 2, sealed: true}
   frames, no time: {training: [], seeds: 1, controls: [evidence]}
+contrasts: {registered: [["frames, no time", no memory]]}
 """
 COMMAND = {"words": [], "ended": False, "wall_s": 60.0, "cpu_s": 50.0}
 """The file of a command."""
@@ -96,6 +97,7 @@ def test_commands_of_the_study_are_understood(tmp_path: Path) -> None:
         ("frames, no time:", "frames | time:", "'frames | time'"),
         ("frames, no time:", "strict:", "'strict'"),
         ("frames, no time:", "seed=1:", "'seed=1'"),
+        ("no memory]]", "no memories]]", "'no memories'.*'no memory'"),
     ],
 )
 def test_invalid_grids_are_refused(tmp_path: Path, old: str, new: str, named: str) -> None:
@@ -319,6 +321,22 @@ def test_tables_show_evaluated_cells(tmp_path: Path) -> None:
         "| frames, no time | 1 | +6.7 | -23.3 to +36.7 |",
     ):
         assert f"\n{line}" in text, line
+
+
+def test_p_is_adjusted_within_a_family(tmp_path: Path) -> None:
+    """Seven of ten rollouts differ: p is 2/2^7. Twice that in a family of two, as it is in one of one."""
+    row, reference, other = "frames, no time", "no memory", "bank"
+    families = f"{{both: [[{row!r}, {reference}], [{row!r}, {other}]], alone: [[{row!r}, {reference}]]}}"
+    grid = grid_of(
+        tmp_path,
+        ('{registered: [["frames, no time", no memory]]}', families),
+        ("rows:\n", "rows:\n  bank: {training: [policy.memory=bank]}\n"),
+    )
+    for name, solved in ((row, 9), (reference, 2), (other, 2)):
+        evaluate(Cell(grid, tmp_path, "strict", name, 0), ROLLOUTS, solved=solved)
+    both, alone = tables(grid, tmp_path, "strict").split("### Contrasts, ")[1:]
+    assert [line.split(" | ")[4] for line in both.splitlines() if " minus " in line] == ["0.031", "0.031"]
+    assert [line.split(" | ")[4] for line in alone.splitlines() if " minus " in line] == ["0.016"]
 
 
 def test_means_of_training_seeds_are_of_exact_figures(grid: Grid, tmp_path: Path) -> None:
