@@ -91,9 +91,14 @@ def test_waiting_for_a_step_of_the_clock_needs_a_short_first_hold() -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("name", task_names(suite="strict"))
-def test_no_strategy_exceeds_the_ceiling(name: str) -> None:
-    task, scenes = get_task(name), 6
-    for strategy in STRATEGIES[str(task.family)].keys() - UNBOUND:
-        solved = sum(bool(rollout(name, strategy, 20_100 + scene)["success"]) for scene in range(scenes))
-        assert solved <= binom.ppf(0.9999, scenes, ceiling(task)), strategy
+@pytest.mark.parametrize(
+    ("family", "strategy"),
+    [(family, strategy) for family, known in STRATEGIES.items() for strategy in sorted(known.keys() - UNBOUND)],
+)
+def test_no_strategy_exceeds_the_ceiling(family: str, strategy: str) -> None:
+    """The tasks of a family together: of one task with a ceiling of 25 %, six of six scenes are not improbable."""
+    tasks, scenes = [task for task in map(get_task, task_names(suite="strict")) if task.family == family], 6
+    solved = sum(bool(rollout(task.name, strategy, 20_100 + k)["success"]) for task in tasks for k in range(scenes))
+    # A sum of unequal probabilities has lighter tails than the binomial of their mean (Hoeffding 1956).
+    most = binom.ppf(0.9999, scenes * len(tasks), np.mean([ceiling(task) for task in tasks]))
+    assert solved <= most < 0.8 * scenes * len(tasks)

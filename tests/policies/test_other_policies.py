@@ -159,7 +159,7 @@ def test_first_plan_reads_the_first_execution_frame(tmp_path: Path, monkeypatch:
     words = dict(word.split("=", 1) for word in DIFFUSION) | {"policy.horizon": "16", "policy.n_action_steps": "8"}
     flags = [f"--{'policy.type' if name == 'policy' else name}={value}" for name, value in words.items()]
     line = [
-        *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}", "--env.prompt_in=reset"),
+        *("--env.type=memobench", f"--env.tasks={MILK}", f"--env.horizon={HORIZON}"),
         *("--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--seed=7"),
         *("--policy.device=cpu", f"--output_dir={tmp_path}", f"--env.log_dir={tmp_path}"),
     ]

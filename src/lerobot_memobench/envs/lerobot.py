@@ -196,7 +196,7 @@ class MemobenchEnvConfig(_WithSettings):
         check_loop(self.settings)
         policy, by = type(self).check_policy(self)
         self.declare_plans(policy)
-        opened = self.opener(None, by, self.resolved_log_dir())  # None: prompts play in steps
+        opened = self.opener(policy, by, self.resolved_log_dir())
         for memory_type, task_id, folder in chosen:
             envs.setdefault(memory_type, {})[task_id] = opened(folder, n_envs, use_async_envs)
         return envs
