@@ -66,6 +66,8 @@ def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequ
     weights = load_file(source / WEIGHTS_FILE)
     narrow = {key: value.to(torch.bfloat16) if value.is_floating_point() else value for key, value in weights.items()}
     save_file(narrow, folder / WEIGHTS_FILE, metadata={"format": "pt"})
+    for path in folder.glob("policy_*processor*"):  # of an earlier policy, perhaps with other names
+        path.unlink()
     for path in source.glob("policy_*processor*"):
         shutil.copy(path, folder)
     config = json.loads((source / "config.json").read_text()) | {"device": "cpu", "pretrained_path": None}
