@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -102,19 +103,22 @@ def test_policy_that_learns_from_the_answer_is_marked_for_good(
     assert (SUPERVISED in str(policy.generate_model_card("user/data", made.type, None, None))) is marked
 
 
-def test_training_from_a_marked_checkpoint_keeps_the_mark() -> None:
-    """The shipped policy learned by alignment; its file is older than the setting."""
-    source = SHIPPED / "memobench_strict"
-    assert "supervised_with_answer" not in json.loads((source / "config.json").read_text())
+def test_training_from_a_marked_checkpoint_keeps_the_mark(tmp_path: Path) -> None:
+    """The shipped policy learned by alignment; files of earlier versions lack the setting."""
+    source = Path(shutil.copytree(SHIPPED / "memobench_strict", tmp_path / "older"))
+    config = json.loads((source / "config.json").read_text())
+    assert config.pop("supervised_with_answer")
+    (source / "config.json").write_text(json.dumps(config))
 
     def asked(*words: str) -> Any:
         words = (f"policy={words[0]}", "align=none", "device=cpu", *words[1:])
         return complete_training(read_words("train", parse_words(words))).policy
 
-    assert asked(source.name).supervised_with_answer
+    assert asked("memobench_strict").supervised_with_answer
+    assert asked(str(source)).supervised_with_answer
     assert not asked("memobench_strict_memoryless").supervised_with_answer
     with pytest.raises(MemobenchError, match=r"follows from policy\.align"):
-        asked(source.name, "policy.supervised_with_answer=false")
+        asked(str(source), "policy.supervised_with_answer=false")
     later: Any = PreTrainedConfig.from_pretrained(source, cli_overrides=["--align=none", "--device=cpu"])
     based = dataclasses.replace(later, base_weights=str(source))
     assert MemobenchMemPolicy(based).config.supervised_with_answer, "as base weights"
