@@ -108,9 +108,9 @@ class Grid:
             self._check_suite(name, suite)
         for name, row in self.rows.items():
             self._check_row(name, row)
-        for row in (row for pairs in self.contrasts.values() for pair in pairs for row in pair):
-            if row not in self.rows:
-                raise MemobenchError(f"contrasts name the row {row!r}; {nearest(row, self.rows)}")
+        for compared in (each for pairs in self.contrasts.values() for pair in pairs for each in pair):
+            if compared not in self.rows:
+                raise MemobenchError(f"contrasts name the row {compared!r}; {nearest(compared, self.rows)}")
 
     def _check_suite(self, name: str, suite: Suite) -> None:
         words = suite.demonstrations
