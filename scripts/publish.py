@@ -8,8 +8,8 @@
 All parts are built and checked before the first is uploaded. The dry run gives the commands of an upload the addresses
 of two local servers, then installs the wheel by its name in an empty environment and evaluates there. An upload refuses
 uncommitted changes, a part that is not at hand, and a version if the index has another wheel of it. The same command
-continues an interrupted upload: index and hub skip files whose hash they have. The last lines
-are the remaining manual steps. The site becomes a static Space, because no workflow publishes it.
+continues an interrupted upload: index and hub skip files whose hash they have. The last lines are the
+remaining manual steps. The site becomes a static Space, because no workflow publishes it.
 """
 
 from __future__ import annotations
