@@ -104,6 +104,15 @@ def test_settings_are_typed_and_completed(
     assert (facts(again), again.grid, again.options.shard) == (facts(plan), plan.grid, plan.options.shard)
 
 
+@pytest.mark.parametrize("words", [SMALL, [*SMALL, "episodes=11"], [*SMALL, "batch_size=3"], []], ids=" ".join)
+def test_a_resumed_evaluation_keeps_batch_and_processes(words: list[str]) -> None:
+    line = [*BARE, *words, "output_dir=out"]
+    plan = plan_line(line)
+    write_evaluation(plan.log, card_of(plan))
+    again = plan_line([*line, "resume=true"])
+    assert (again.batch, again.settings.use_async_envs) == (plan.batch, plan.settings.use_async_envs)
+
+
 CHECKPOINT = shipped_policies()["memobench_strict"]
 BAD: list[tuple[list[str], str]] = [
     (["episodes=many"], "a whole number"),

@@ -430,14 +430,15 @@ def with_batch_size(
         )
     if requested:
         return settings
+    learned = policy.type not in SCRIPTED and policy.device == "cpu"
+    together = learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs
     if options.resume and (earlier := earlier_batch_size(log)) is not None:
-        return replace(settings, batch_size=earlier)
+        return replace(settings, batch_size=earlier, use_async_envs=False if together else settings.use_async_envs)
     if (options.shards or options.shard is not None) and settings.batch_size is None:
         return replace(settings, batch_size=1)
     # A policy may serve few environments at once, such as one for each of its servers.
     most = min(episodes, getattr(policy, "max_environments", None) or LARGEST_BATCH)
-    learned = policy.type not in SCRIPTED and policy.device == "cpu"
-    if learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs:
+    if together:
         return replace(settings, batch_size=min(OBJECT_BATCH, most), use_async_envs=False)
     limit = max(1, min(int(cores() * 0.7), most))  # LeRobot's share of the cores
     return replace(settings, batch_size=max(size for size in range(1, limit + 1) if episodes % size == 0))
