@@ -141,6 +141,8 @@ BAD: list[tuple[list[str], str]] = [
     (["--policy.path=outputs/none"], "outputs/none does not exist"),
     (["shard=a/b"], "shard=a/b"),
     (["workers=3"], "shards=8"),
+    (["shard=1/4"], "without output_dir=; name the folder that all parts share"),
+    (["shards=2", "output_dir=out", "env.log_dir=elsewhere"], "log_dir=elsewhere of an evaluation in parts"),
     (["shard=1/2", "shards=2"], "shards=2"),
 ]
 

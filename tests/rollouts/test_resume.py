@@ -70,10 +70,11 @@ def test_resume_equals_undisturbed_run(fake_loop: FakeLoop, way: str, count: int
     assert opened == {task for task, _ in ALL[count:]}, "environments of finished tasks are not opened"
     assert results("out") == results("undisturbed")
     assert not any(draft.exists() for draft in drafts)
-    # All is done: no episode runs, and no result changes.
-    before = results("out")
+    # All is done: no episode runs, no result changes, and the card has no more starts.
+    before, card = results("out"), json.loads(Path("out/evaluation.json").read_text())
     assert set(commands(way, "out", "resume=true")) == {0}
     assert (fake_loop.ran, results("out")) == (ALL[count:], before)
+    assert json.loads(Path("out/evaluation.json").read_text())["runs"] == card["runs"]
 
 
 @pytest.mark.parametrize("way", ["whole", "parts", "jobs"])

@@ -170,6 +170,11 @@ def test_parts_repeat_the_command_and_decide_the_device_where_they_run(
     here = plan_shards(plan_line([*LINE, "shards=2"]), (), print)
     assert {job.at_once for job in here} == {2}
     assert here[0].episodes | here[1].episodes == {(task, k) for task in (STOVE, DRAWER) for k in range(4)}
+    assert not any("use_async_envs" in word for job in here for word in job.arguments)
+    together = plan_line([*LINE, "policy=memobench_strict", "device=cpu", "batch_size=0", "shards=2"])
+    for job in plan_shards(together, (), print):  # ten rows in one process, in parts too
+        settings = plan_line(job.arguments[1:]).settings
+        assert (settings.batch_size, settings.use_async_envs) == (together.batch, False)
     with pytest.raises(MemobenchError, match="4 batches"):
         plan_shards(plan_line([*LINE, "shards=9"]), (), print)
 

@@ -72,7 +72,6 @@ def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: Batch
             tasks = count_of(len(plan.grid.tasks), "task") + (" with variants" if plan.environment.evidence else "")
             episodes = count_of(plan.grid.runs, "episode")
             begin(f"evaluating {policy} on {tasks}, {episodes} each, into {plan.output}")
-            write_evaluation(plan.log, card)
             try:
                 evaluate(plan, cells, card, advance)
             except BaseException:  # Ctrl-C too
@@ -82,8 +81,9 @@ def run_evaluation(plan: EvaluationPlan, note: Note, begin: Note, advance: Batch
                         f"resume: `{plan.resuming_command}`"
                     )
                 raise
-        elif has_log(plan.log):
-            write_evaluation(plan.log, card)
+        elif has_log(plan.log):  # this start runs nothing, so it is none of the card's runs
+            earlier = read_evaluation(plan.log).get("runs", card["runs"])
+            write_evaluation(plan.log, {**card, "runs": earlier})
         else:
             return None
         return write_report(plan.log)

@@ -359,6 +359,11 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
             f"found suite={suite} with policy={policy.type}; LIBERO's tasks have no scripted expert: name a policy, "
             "policy=<checkpoint>"
         )
+    if (options.shards or options.shard is not None) and settings.env.get("log_dir") is not None:
+        raise MemobenchError(
+            f"found log_dir={settings.env['log_dir']} of an evaluation in parts, each of which has a log of its own in "
+            "output_dir=; leave it out"
+        )
     output = _output(settings, options, policy)
     log = Path(settings.env.get("log_dir") or output)
     settings = with_batch_size(with_defaults(settings, options, policy), options, log, policy)
@@ -382,6 +387,8 @@ def make_plan(settings: EvaluationSettings, options: RunOptions, command: Sequen
 
 def _output(settings: EvaluationSettings, options: RunOptions, policy: PreTrainedConfig) -> Path:
     """Return the folder of the evaluation or of its part; by default a new dated folder."""
+    if options.shard is not None and settings.output_dir is None:
+        raise MemobenchError(f"found shard={options.shard} without output_dir=; name the folder that all parts share")
     if settings.output_dir is not None:
         checkpoint = settings.policy.get("path")
         if checkpoint is not None and Path(settings.output_dir).resolve() == Path(checkpoint).resolve():
@@ -432,7 +439,8 @@ def with_batch_size(
         return settings
     learned = policy.type not in SCRIPTED and policy.device == "cpu"
     together = learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs
-    if options.resume and (earlier := earlier_batch_size(log)) is not None:
+    folders = (log, *sorted(log.glob(Shard.FOLDERS)))
+    if options.resume and (earlier := next(filter(None, map(earlier_batch_size, folders)), None)) is not None:
         return replace(settings, batch_size=earlier, use_async_envs=False if together else settings.use_async_envs)
     if (options.shards or options.shard is not None) and settings.batch_size is None:
         return replace(settings, batch_size=1)

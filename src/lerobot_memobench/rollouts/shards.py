@@ -92,6 +92,7 @@ class ShardJob:
         """Run the part in a process of its own, which ends when this process does; raise with its error message."""
         self.messages.parent.mkdir(parents=True, exist_ok=True)
         with self.messages.open("ab") as file:
+            begin = file.tell()  # after the messages of earlier starts
             process = subprocess.Popen(
                 [sys.executable, *self.program, *self.arguments],
                 cwd=self.directory,
@@ -107,7 +108,7 @@ class ShardJob:
                 process.wait()
                 raise
         if status:
-            lines = self.messages.read_text(errors="replace").splitlines()
+            lines = self.messages.read_bytes()[begin:].decode(errors="replace").splitlines()
             errors = [line.removeprefix("lerobot: ") for line in lines if line.startswith("lerobot: ")]
             raise MemobenchError(
                 f"{self.task_name} ended with {errors[-1] if errors else f'status {status}'} (see {self.messages}); "
@@ -123,7 +124,9 @@ def plan_shards(plan: EvaluationPlan, program: Sequence[str], note: Note) -> lis
     options, grid, out = plan.options, plan.grid, plan.output.absolute()
     if options.shards > (batches := len(grid.cells())):
         raise MemobenchError(f"found shards={options.shards} and only {batches} batches of episodes; ask for fewer")
-    own = dict.fromkeys(("shards", "workers", "output_dir", "resume"))
+    own: dict[str, object] = dict.fromkeys(("shards", "workers", "output_dir", "resume"))
+    together = plan.settings.use_async_envs is False  # of the whole, which the parts' own batch size would not imply
+    own |= {"eval.use_async_envs": "false"} if together else {}
     words = with_changes(plan.command[2:], **own, batch_size=plan.batch, salt=plan.environment.salt)
     jobs = [
         ShardJob(
@@ -194,8 +197,8 @@ def merge(out: Path, folders: Sequence[Path]) -> None:
         if source != out:
             _share(source / VIDEOS, out / VIDEOS, "*.mp4")
             _share(source / MEMORY_READS, out / MEMORY_READS, "*.json.gz")
+    write_evaluation(out, card)  # first: a log without its card could not be merged again
     write_episodes(out, records)
-    write_evaluation(out, card)
 
 
 def join(parts: Mapping[Path, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
