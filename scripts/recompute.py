@@ -263,7 +263,8 @@ def _flat(text: str) -> str:
 
 def keep_evaluation(folder: Path, name: str) -> str:
     """Add an evaluation to the results under a name; return its row for a table of results."""
-    write_report(folder)  # merges the workers' files
+    if (missing := write_report(folder).missing) is not None:  # the report merges the workers' files
+        raise MemobenchError(f"{folder} is not a whole evaluation, {missing}")
     with tempfile.TemporaryDirectory() as root:
         (Path(root) / name).symlink_to(folder.resolve())
         keep(Path(root), [name], EVALUATIONS)

@@ -24,16 +24,19 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_memobench.datasets.episodes import read_manifest
 from lerobot_memobench.envs.episode_log import MERGED_FILE
-from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE
+from lerobot_memobench.envs.evaluation_file import EVALUATION_FILE, read_evaluation
+from lerobot_memobench.evaluation.records import read_run
 from lerobot_memobench.evaluation.report import REPORT_JSON
 from lerobot_memobench.io import file_hash, write_file
 from lerobot_memobench.policies.checkpoint import (
     ELSEWHERE,
     SHIPPED,
     WEIGHTS_FILE,
+    checkpoint_files,
     checkpoint_folder,
     encoded_config,
     shipped_policies,
+    tree_hash,
 )
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SUPERVISED, MemobenchMemConfig
 from lerobot_memobench.rollouts.card import git, training_facts
@@ -45,7 +48,18 @@ LARGEST = 4_000_000
 """Bytes that one policy may take."""
 FOLLOWING = ("input_features", "output_features", "object_classes", "supervised_with_answer")
 """Settings of a policy that its dataset or other settings decide."""
-OF_THE_MACHINE = ("policy", "output_dir", "resume", "videos", "batch_size", "device")
+OF_THE_MACHINE = (
+    "env",
+    "policy",
+    "output_dir",
+    "resume",
+    "videos",
+    "batch_size",
+    "device",
+    "shard",
+    "shards",
+    "workers",
+)
 """Words of an evaluation's command that a card does not repeat."""
 HEAD = """---
 license: apache-2.0
@@ -62,6 +76,8 @@ def ship(run: Path, name: str, rollouts: Path | None, merged: Mapping[Path, Sequ
     source, folder = checkpoint_folder(str(run)), SHIPPED / name
     if source is None:
         raise SystemExit(f"{run} holds no checkpoint; name the output_dir of a `lerobot train`")
+    if rollouts is not None:
+        check_rollouts(rollouts, folder)
     folder.mkdir(parents=True, exist_ok=True)
     weights = load_file(source / WEIGHTS_FILE)
     narrow = {key: value.to(torch.bfloat16) if value.is_floating_point() else value for key, value in weights.items()}
@@ -124,9 +140,15 @@ def trainings(source: Path) -> list[dict[str, Any]]:
         policy = json.loads((source / "config.json").read_text())
         return [{"shipped": source.name, "folder": source, "policy": policy}]
     run: dict[str, Any] = json.loads((source / TRAINED).read_text())
-    begun = run["policy"].get("pretrained_path")  # of a training that went on after an interruption: its own
-    another = begun is not None and not Path(begun).is_relative_to(run["output_dir"])
-    return [*(trainings(Path(begun)) if another else []), run]
+    begun = run["policy"].get("pretrained_path")
+    if begun is not None and source.resolve().parents[1] == Path(begun).resolve().parents[1]:
+        # A resumed training names its own checkpoint. Its first one names the policy it began from, unless it was
+        # itself saved after an interruption.
+        first = min(path for path in source.resolve().parents[1].iterdir() if path.name.isdecimal())
+        begun = json.loads((first / source.name / TRAINED).read_text())["policy"].get("pretrained_path")
+        if begun is not None and Path(begun).resolve().parents[1] == first.parent:
+            raise SystemExit(f"{first} does not name the policy that the training began from; write its card by hand")
+    return [*(trainings(Path(begun)) if begun is not None else []), run]
 
 
 def training(run: dict[str, Any], before: dict[str, Any] | None, named: bool) -> list[str]:
@@ -242,6 +264,7 @@ def driver(request: dict[str, Any]) -> str | None:
 
 def results(name: str, rollouts: Path) -> list[str]:
     """Return the results of an evaluation, as a table."""
+    check_rollouts(rollouts, SHIPPED / name)
     report = json.loads((rollouts / REPORT_JSON).read_text())
     rows = {**report["memory_types"], "average": report["average"], **report["tasks"]}
     body = [
@@ -249,10 +272,22 @@ def results(name: str, rollouts: Path) -> list[str]:
         for scope, row in rows.items()
     ]
     head = ["| | rollouts | SR | MSR | MUR | MCR |", "|---|---|---|---|---|---|"]
-    given = json.loads((rollouts / EVALUATION_FILE).read_text())["runs"][0]["command"][3:]
+    given = json.loads((rollouts / EVALUATION_FILE).read_text())["runs"][0]["command"][2:]
     words = [f"policy={name}", *(word for word in given if word.partition("=")[0] not in OF_THE_MACHINE)]
     command = shlex.join(["lerobot", "eval", "env=memobench", *words])
     return ["", f"`{command}`, sha256 of its log `{file_hash(rollouts / MERGED_FILE)}`:", "", *head, *body]
+
+
+def check_rollouts(rollouts: Path, folder: Path) -> None:
+    """Refuse rollouts that are not whole, or of other weights than those in the policy's folder."""
+    whole = read_evaluation(rollouts, whole=True)
+    if not (rollouts / REPORT_JSON).is_file() or read_run(rollouts).missing is not None:
+        raise SystemExit(f"{rollouts} lacks episodes or its report; resume the evaluation, then `memobench report` it")
+    if whole["runs"][0]["command"][:2] != ["lerobot", "eval"]:
+        raise SystemExit(f"{rollouts} is not of `lerobot eval`, so its command is not known; evaluate the policy by it")
+    here = tree_hash(checkpoint_files(folder)) if folder.is_dir() else None
+    if (there := whole["policy"].get("sha256")) != here:
+        raise SystemExit(f"{rollouts} has rollouts of other weights ({there}) than {folder} ({here}); evaluate those")
 
 
 def replace_results(name: str, rollouts: Path) -> Path:

@@ -9,13 +9,17 @@ import statistics
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
+from lerobot_memobench.evaluation.report import write_report
 from lerobot_memobench.policies.checkpoint import TRAIN_CONFIG, encoded_config, shipped_policies
 from lerobot_memobench.policies.memobench_mem.configuration_memobench_mem import SUPERVISED, MemobenchMemConfig
+from research.kept import restore
 from scripts import ship_policy
 from scripts.nets.mutants import place_of, table
 from scripts.nets.store import ROOT, differences
@@ -131,6 +135,49 @@ def test_card_of_a_shipped_policy_has_its_mark(tmp_path: Path) -> None:
     for folder in shipped_policies().values():
         marked = MemobenchMemConfig.from_pretrained(folder, cli_overrides=["--device=cpu"]).supervised_with_answer
         assert (f"**{SUPERVISED}.**" in (folder / "README.md").read_text()) == marked
+
+
+def test_a_resumed_training_names_the_policy_it_began_from(tmp_path: Path) -> None:
+    checkpoints = tmp_path / "outputs" / "run" / "checkpoints"
+    begun = {"002": "outputs/first/checkpoints/002/pretrained_model", "004": str(checkpoints / "last/pretrained_model")}
+    begun |= {"006": "outputs/run/checkpoints/last/pretrained_model"}  # relative, as a resumed training may save it
+    for step, path in begun.items():
+        folder = checkpoints / step / "pretrained_model"
+        folder.mkdir(parents=True)
+        (folder / TRAIN_CONFIG).write_text(
+            json.dumps({"policy": {"pretrained_path": path}, "output_dir": "outputs/run"})
+        )
+    (checkpoints / "last").symlink_to("006")
+    first = tmp_path / "outputs" / "first" / "checkpoints" / "002" / "pretrained_model"
+    first.mkdir(parents=True)
+    (first / TRAIN_CONFIG).write_text(json.dumps({"policy": {"pretrained_path": None}, "output_dir": "outputs/first"}))
+    with chdir(tmp_path):
+        for step in begun:
+            found = ship_policy.trainings(checkpoints / step / "pretrained_model")
+            assert [run["output_dir"] for run in found] == ["outputs/first", "outputs/run"]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda card: card["policy"].update(sha256="0" * 64), "other weights"),
+        (lambda card: card["runs"][0].update(command=["memobench", "rerun"]), "not of `lerobot eval`"),
+        (lambda card: card["protocol"].update(episodes=9), "lacks episodes"),
+    ],
+)
+def test_other_rollouts_are_not_put_on_a_card(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], named: str
+) -> None:
+    restore(ROOT / "results" / "evaluations", tmp_path, ["strict_validation_memory"])
+    folder = tmp_path / "strict_validation_memory"
+    write_report(folder)
+    ship_policy.check_rollouts(folder, ship_policy.SHIPPED / "memobench_strict")
+    assert "shard" not in "".join(ship_policy.results("memobench_strict", folder)[:2])
+    card = json.loads((folder / "evaluation.json").read_text())
+    change(card)
+    (folder / "evaluation.json").write_text(json.dumps(card))
+    with pytest.raises(SystemExit, match=named):
+        ship_policy.check_rollouts(folder, ship_policy.SHIPPED / "memobench_strict")
 
 
 # --- scripts/nets ---

@@ -78,7 +78,9 @@ def sweep(
                 raise MemobenchError(f"{kept} holds no evaluation of a sweep; give a folder that --keep has written")
             show(Path(folder), names, out)
         return
-    checkpoints, intervals = dict(map(read_policy, policy or [])), sorted(replan or INTERVALS)
+    checkpoints, intervals = dict(map(read_policy, policy or [])), sorted({*(replan or INTERVALS)})
+    if len(checkpoints) < len(policy or []):
+        raise MemobenchError(f"found two policies of one name in --policy {' '.join(policy or [])}; name each once")
     for name, (_, config) in checkpoints.items():
         if intervals[-1] > config.chunk_size:
             raise MemobenchError(
@@ -109,9 +111,14 @@ def show(source: Path, names: Iterable[str], out: Path) -> None:
 
 def runs_of(source: Path, names: Iterable[str]) -> Runs:
     """Return the evaluations of these names in ``source``; plan interval and feeding are those of their cards."""
-    found = {}
+    found, hashes = {}, dict[str, Any]()
     for name in names:
         run = read_run(source / name)
+        policy, here = name.partition("/")[0], run.card[POLICY].get("sha256")
+        if here is not None and hashes.setdefault(policy, here) != here:
+            raise MemobenchError(
+                f"{source / name} is of other weights of {policy} than an earlier evaluation; delete it"
+            )
         fed = PLANS if run.card[POLICY]["type"] == FED_AT_PLANS else STEPS
         found[Place(name.partition("/")[0], run.protocol["replan_steps"], fed)] = run
     return {place: found[place] for place in sorted(found, key=lambda each: (*each[:2], FED.index(each.fed)))}

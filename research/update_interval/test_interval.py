@@ -112,6 +112,12 @@ def test_the_table_names_both_intervals_and_is_made_again_of_the_kept_tables(
     assert "| -50.0 [" in lines[8]
     assert (tmp_path / "first" / "interval.png").stat().st_size > 10_000
 
+    for sha256, replan in (("1", 10), ("2", 16)):
+        policy = {"type": "memobench_mem", "settings": {}, "sha256": sha256}
+        evaluation(tmp_path / "mixed" / f"each step, {replan}", 3, policy=policy, replan_steps=replan)
+    with pytest.raises(MemobenchError, match="each step, 16 is of other weights of mixed"):
+        program.show(tmp_path, ["mixed/each step, 10", "mixed/each step, 16"], tmp_path / "joined")
+
     evaluation(tmp_path / "other")
     program.store.keep(tmp_path, ["other"], tmp_path / "kept")  # of another program
     program.sweep(tmp_path / "again", kept=tmp_path / "kept")
@@ -125,6 +131,7 @@ def test_the_table_names_both_intervals_and_is_made_again_of_the_kept_tables(
         ({}, "give one"),
         ({"policy": ["mine=x"], "kept": Path("kept")}, "give one"),
         ({"replan": [5], "kept": Path("kept")}, "give one"),
+        ({"policy": [f"mine={STRICT}", f"mine={STRICT}"]}, "two policies of one name"),
         ({"policy": [f"mine={STRICT}"], "replan": [20]}, "interval of 20 and chunks of 16"),
     ],
 )

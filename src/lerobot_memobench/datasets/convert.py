@@ -26,7 +26,7 @@ from pydantic import BaseModel
 
 from lerobot_memobench.constants import CAMERAS, IMAGE_SIZE
 from lerobot_memobench.datasets.episodes import ConversionNote, DemonstrationRecord
-from lerobot_memobench.datasets.generate import check_room, run_size
+from lerobot_memobench.datasets.generate import check_room, run_size, versions_of_numbers
 from lerobot_memobench.datasets.hdf5 import NO_SEED, PublishedFile, demo_number, first_line
 from lerobot_memobench.datasets.layout import DEFAULT_REPO_ID, STAGING
 from lerobot_memobench.datasets.restore import ORIENTATIONS, orientation_of, restore, task_of, unlike_the_catalogue
@@ -113,7 +113,7 @@ def convert(
         return ConversionSummary(out, len(manifest["episodes"]), *map(tuple, earlier))
     with (
         explaining_disk_errors(out, "finished episodes stay, and the same command continues"),
-        episodes_folder(out, request) as folder,
+        episodes_folder(out, {**request, "versions": versions_of_numbers()}) as folder,
     ):
         _report_size(files, folder, out, notify)
         shutil.rmtree(staging / "unpacked", ignore_errors=True)  # a killed run may have left a part

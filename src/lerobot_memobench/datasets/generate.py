@@ -114,8 +114,7 @@ def generate(
         "hold_frames": HOLD_FRAMES,
         **asdict(settings),
         "task_files": [task_hash(task) for task in tasks],
-        # An episode's numbers depend on them.
-        "versions": {name: version(name) for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av")},
+        "versions": versions_of_numbers(),
     }
     prompts = "" if demonstration_prompt else ", demonstration prompts left out"
     more = "" if prompted_episodes is None else f" ({prompted_episodes} of those with a prompt)"
@@ -197,6 +196,11 @@ def task_hash(task: Task) -> str:
 
 
 # --- size and time ---
+
+
+def versions_of_numbers() -> dict[str, str]:
+    """Return package -> version of the packages on which an episode's numbers depend."""
+    return {name: version(name) for name in ("lerobot_policy_memobench", "mujoco", "numpy", "av")}
 
 
 def run_size(frames: int, image_size: int | None, held_frames: int = 0) -> int:

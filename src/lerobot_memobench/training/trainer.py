@@ -107,7 +107,7 @@ def prepare(
             f"note: {meta.root} has images of {height} x {width} pixels, and policy={policy.type} does not resize "
             f"them; evaluate it with observation_height={height} observation_width={width}"
         )
-    changed = needs_view(meta.features, options)
+    changed = needs_view(meta.features, options) and not config.resume  # it reads what the training was begun with
     if dataset.streaming and not (Path(meta.root) / "data").is_dir():
         if changed:
             raise MemobenchError(
