@@ -42,7 +42,7 @@ TASKS = (
 )
 """One task of each memory type, for the first part."""
 STRICT_TASK = "put_only_the_milk_from_the_highlighted_location_in_the_prompt_video_on_the_plate"
-"""Task of the second part: the two policies differed in it on validation seeds."""
+"""Task of the second part, with the shortest prompt; former policies differed in it on validation seeds."""
 POLICIES: dict[str, tuple[str, ...]] = {
     "expert": (),
     "with memory": ("policy=memobench_strict",),

@@ -162,7 +162,7 @@ class EnvSettings:
         1, "control steps of observations in an input of a policy without a memory", least=1, usual="the policy's"
     )
     delay_steps: int = setting(0, "control steps from an observation to the first action planned from it", least=0)
-    render: str = setting("default", "high is for figures and four times slower", QUALITIES)
+    render: str = setting("default", "high is for figures: four samples per pixel, slower", QUALITIES)
     oracle_memory: bool = setting(False, "the instruction ends with the completed checkpoints (oracle memory control)")
     pause_steps: int = setting(
         0, "control steps of each pause, at moments drawn by the seed (pause control, see memobench compare)", least=0

@@ -44,7 +44,7 @@ MAX_SCENES = 200  # maximum number of draws of a strict scene
 NO_OP = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # no motion, gripper open
 
 DEFAULT, HIGH = "default", "high"
-QUALITIES = (DEFAULT, HIGH)  # ``high`` is for figures and videos: a pixel is the mean of four, at four times the cost
+QUALITIES = (DEFAULT, HIGH)  # ``high`` is for figures and videos: a pixel is the mean of four samples
 CACHED_RASTERIZERS = 4  # rasterizers cached per thread; each holds textures and backgrounds of its scene, some 40 MB
 
 
