@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 from lerobot_memobench.constants import OBS_PHASE, OBS_STEP
 from lerobot_memobench.policies.memobench_mem.memory import NONE, OURS
 from lerobot_memobench.policies.memobench_mem.modeling_memobench_mem import MemobenchMemPolicy
-from lerobot_memobench.training.loop import TRAINING_FILE
+from lerobot_memobench.training.loop import TRAINING_FILE, TrainingState
 from tests.training.conftest import hashes, read_losses
 
 SEEN = {
@@ -26,6 +26,7 @@ SEEN = {
         "dataset.image_transforms.enable=true",
     ),
 }
+ROLLED = ("env.obs_type=environment_state_agent_pos", "env_eval_freq=1", "eval.n_episodes=1", "eval.batch_size=1")
 DEFAULT = {("pixels", "frames"), ("objects", "bank"), ("objects", "subgoal")}
 CASES = [
     pytest.param(seen, memory, marks=() if (seen, memory) in DEFAULT else pytest.mark.slow)
@@ -63,6 +64,37 @@ def test_training_saves_resumes_to_the_bit_and_acts(
         action = after(policy.select_action(before(observation(policy, step))))
         assert action.shape == (1, 7)
         assert action.isfinite().all()
+
+
+def test_interrupted_rollouts_are_made_up_for(
+    objects: Path, tmp_path: Path, train: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def evaluate(_: Any, step: int) -> dict[str, Any]:
+        asked.append(step)
+        if len(asked) == 2:
+            raise Killed
+        return {"overall": {"avg_sum_reward": 0.0, "pc_success": 50.0, "eval_s": 1.0}}
+
+    asked: list[int] = []
+    monkeypatch.setattr(TrainingState, "evaluate", evaluate)
+    words = (
+        "policy=memobench_mem",
+        *SEEN["objects"],
+        "policy.memory=none",
+        f"dataset={objects}",
+        "steps=2",
+        "save_freq=1",
+    )
+    with pytest.raises(Killed):
+        train(*words, f"output_dir={tmp_path / 'run'}", "env=memobench", *ROLLED)
+    for _ in range(2):
+        train(f"output_dir={tmp_path / 'run'}", "resume=true")
+    assert asked == [1, 2, 2]  # once more, and not once more again
+    rates = [row[0] for row in read_losses(tmp_path / "run") if row[2] == "pc_success"]
+    assert rates == [1, 2]
 
 
 def observation(policy: Any, step: int) -> dict[str, Any]:

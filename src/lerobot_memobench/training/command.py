@@ -95,7 +95,7 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
     config = complete_training(requested, notify)
     if config.checkpoint_path is not None:
         done = step_reached(config.checkpoint_path)
-        if done >= config.steps:
+        if done >= config.steps and not lacks_rollouts(config, done):
             run = config.checkpoint_path.parents[1]
             notify(f"the training in {run} has finished its {done} steps; for more, set steps=")
             return 0
@@ -115,6 +115,15 @@ def run_training(words: Mapping[str, str], notify: Callable[[str], None]) -> int
 
             run_lerobot(prepare(config, prompt_frames, obs_type, notify))
     return 0
+
+
+def lacks_rollouts(config: TrainPipelineConfig, step: int) -> bool:
+    """Return whether a memory policy's training was interrupted in its last rollouts."""
+    if config.policy is None or config.policy.type != MEMORY_POLICY:
+        return False  # LeRobot's trainer does not log them in a file
+    from lerobot_memobench.training.loop import rollouts_missing
+
+    return rollouts_missing(config, step)
 
 
 @contextmanager

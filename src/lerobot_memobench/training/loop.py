@@ -83,9 +83,13 @@ def train(config: TrainPipelineConfig) -> None:
         training.policy, optimizer, loader, scheduler, held_out_loader
     )
     state = TrainingState(config, accelerator, training, model, average, optimizer, scheduler)
+    interrupted = accelerator.is_main_process and rollouts_missing(config, step)
     log, batches = TrainingLog(config, training.dataset, accelerator, step), cycle(loader)
     model.train()
     seed = torch.initial_seed() if config.seed is None else config.seed
+    if interrupted:
+        log.write_evaluation(step, state.evaluate(step))
+    accelerator.wait_for_everyone()
     while step < config.steps:
         # Processes draw different noise, and a resumed training draws what an uninterrupted one does.
         set_seed(seed_of(seed, accelerator.process_index, step))
@@ -102,7 +106,7 @@ def train(config: TrainPipelineConfig) -> None:
             if accelerator.is_main_process:
                 log.keep_model(state.save(step))
             accelerator.wait_for_everyone()
-        if config.env is not None and config.env_eval_freq > 0 and step % config.env_eval_freq == 0:
+        if rollouts_due(config, step):
             if accelerator.is_main_process:
                 log.write_evaluation(step, state.evaluate(step))
             accelerator.wait_for_everyone()
@@ -111,6 +115,28 @@ def train(config: TrainPipelineConfig) -> None:
     accelerator.end_training()  # LeRobot's main branch would wait for the others of the group in an upload
     if accelerator.is_main_process and policy_config.push_to_hub:
         state.push()
+
+
+def rollouts_due(config: TrainPipelineConfig, step: int) -> bool:
+    """Return whether the policy is evaluated after ``step`` updates."""
+    return config.env is not None and config.env_eval_freq > 0 and step > 0 and step % config.env_eval_freq == 0
+
+
+def rollouts_missing(config: TrainPipelineConfig, step: int) -> bool:
+    """Return whether a training was interrupted in the rollouts after ``step`` updates, which follow the checkpoint."""
+    assert config.output_dir is not None
+    rates = ("eval", "pc_success")
+    return rollouts_due(config, step) and not any(
+        row[0] == str(step) and tuple(row[1:3]) == rates for row in written_rows(config.output_dir / LOSSES)
+    )
+
+
+def written_rows(file: Path) -> list[list[str]]:
+    """Return the rows of a training's log below its heading; none where the file is missing."""
+    if not file.is_file():
+        return []
+    with file.open(encoding="utf-8", newline="") as before:
+        return [row for row in csv.reader(before) if row and row[0].isdecimal()]
 
 
 def begin(config: TrainPipelineConfig) -> Accelerator:
@@ -489,10 +515,8 @@ class TrainingLog:
         if self._first:
             logger.info("Output dir: %s", config.output_dir)
             logger.info("%d frames of %d episodes", frames, episodes)
-            rows = [["step", "mode", "name", "value"]]
-            if self._file.is_file():  # of a resumed training, which writes the later rows again
-                with self._file.open(encoding="utf-8", newline="") as before:
-                    rows += [row for row in csv.reader(before) if row[0].isdecimal() and int(row[0]) <= step]
+            rows = [["step", "mode", "name", "value"]]  # a resumed training writes the later rows again
+            rows += [row for row in written_rows(self._file) if int(row[0]) <= step]
             self._file.parent.mkdir(parents=True, exist_ok=True)
             self._write_rows(rows, "w")
 
