@@ -36,7 +36,7 @@ class PublishedRow(NamedTuple):
     """One row of one of the paper's tables of rates.
 
     Attributes:
-        table: key of ``TABLES``. model: as ``tables.json`` names it. replan_steps: None where the paper does not state it.
+        table: key of ``TABLES``. model: as ``tables.json`` names it. replan_steps: None where the paper states none.
         memory_types: memory type -> figures. average: the paper's own average column.
     """
 
