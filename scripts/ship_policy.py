@@ -144,7 +144,8 @@ def trainings(source: Path) -> list[dict[str, Any]]:
     if begun is not None and source.resolve().parents[1] == Path(begun).resolve().parents[1]:
         # A resumed training names its own checkpoint. Its first one names the policy it began from, unless it was
         # itself saved after an interruption.
-        first = min(path for path in source.resolve().parents[1].iterdir() if path.name.isdecimal())
+        saved = [path for path in source.resolve().parents[1].iterdir() if path.name.isdecimal()]
+        first = min(saved, key=lambda path: int(path.name))
         begun = json.loads((first / source.name / TRAINED).read_text())["policy"].get("pretrained_path")
         if begun is not None and Path(begun).resolve().parents[1] == first.parent:
             raise SystemExit(f"{first} does not name the policy that the training began from; write its card by hand")
