@@ -1,8 +1,8 @@
 """Recompute the published figures from the kept rollouts; fail where a page differs.
 
 ``python scripts/recompute.py`` checks README, ``docs/benchmark/results.md`` and ``results/demonstrations.md``. The
-last cell of a table's row names the source of its values: an evaluation in ``results/*/rollouts.parquet``, a run in
-``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
+last cell of a table's row names the source of its values: an evaluation in ``results/*/rollouts.parquet``, the log of
+a row of the board, a run in ``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
 not kept*. Rows of ``results/study.md`` are rows of the tables that ``research.memory_study`` makes of the kept cells.
 Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be there.
 
@@ -25,10 +25,11 @@ import pyarrow.parquet as pq
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))  # `research` is not installed
 
+from lerobot_memobench.board.submission import LOG  # noqa: E402
 from lerobot_memobench.errors import MemobenchError, nearest  # noqa: E402
 from lerobot_memobench.evaluation.evidence import Evidence  # noqa: E402
 from lerobot_memobench.evaluation.metrics import PAPER_METRICS, Rate, Row, mean_row, percent  # noqa: E402
-from lerobot_memobench.evaluation.records import read_runs  # noqa: E402
+from lerobot_memobench.evaluation.records import Run, read_runs  # noqa: E402
 from lerobot_memobench.evaluation.report import write_report  # noqa: E402
 from lerobot_memobench.tasks.catalogue import get_task, task_number  # noqa: E402
 from lerobot_memobench.tasks.task import MEMORY_TYPES  # noqa: E402
@@ -36,6 +37,7 @@ from research.kept import ROLLOUTS as ROLLOUT_TABLE  # noqa: E402
 from research.kept import keep, restore  # noqa: E402
 from research.memory_study.grid import GRID_FILE, read_grid  # noqa: E402
 from research.memory_study.tables import tables as study_tables  # noqa: E402
+from tools.board.submission import read_submission  # noqa: E402
 
 RESULTS = ROOT / "results"
 EVALUATIONS = RESULTS / "evaluations"
@@ -92,6 +94,17 @@ def of_tasks(tasks: Mapping[str, Row]) -> Values:
 def of_evaluation(folder: Path) -> Values:
     """Return the figures of an evaluation, counted as the report counts them."""
     (run,) = read_runs([folder])
+    return of_run(run)
+
+
+@cache
+def of_board(row: Path) -> Values:
+    """Return the figures of a row of the board."""
+    return of_run(read_submission(row).evaluation)
+
+
+def of_run(run: Run) -> Values:
+    """Return the figures of an evaluation that was read."""
     summary, evidence = run.summary, run.evidence.average if run.evidence else None
     return {
         **(of_evidence(evidence) if evidence else {}),
@@ -169,6 +182,8 @@ def source_of(page: Path, cell: str) -> Values | None:
         file = (page.parent / target).resolve()
         if file.name == ROLLOUT_TABLE:
             return of_kept(file.parent, name)
+        if file.name == LOG:
+            return of_board(file.parent)
         if file.name == "demonstrations.parquet":
             return of_demonstrations(file, name)
         if file.name == "README.md" and file.parent.name.startswith("memobench_"):
