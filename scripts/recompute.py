@@ -2,8 +2,9 @@
 
 ``python scripts/recompute.py`` checks README, ``docs/benchmark/results.md`` and ``results/demonstrations.md``. The
 last cell of a table's row names the source of its values: an evaluation in ``results/*/rollouts.parquet``, the log of
-a row of the board, a run in ``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that cannot be recomputed has *log
-not kept*. Rows of ``results/study.md`` are rows of the tables that ``research.memory_study`` makes of the kept cells.
+a row of the board, a run in ``results/demonstrations.parquet``, or the table of a shipped policy's card. A row that
+cannot be recomputed has *log not kept*. Rows of ``results/study.md`` are rows of the tables that
+``research.memory_study`` makes of the kept cells.
 Claims in other places are listed in ``results/figures.md``, each with the words of its source: both must be there.
 
 ``python scripts/recompute.py keep FOLDER NAME`` adds an evaluation to ``results/evaluations`` and prints its row.
