@@ -173,7 +173,7 @@ def draw(runs: Runs, path: Path) -> None:
     """Draw success over the plan interval, a panel for each policy, with Wilson's intervals."""
     names, handles = list(dict.fromkeys(place.policy for place in runs)), dict[str, Any]()
     with paper_style(), draft_of(path) as draft:
-        figure = new_figure(1.6 + 1.5 * len(names), 2.4)
+        figure = new_figure(3.0 + 1.5 * len(names), 2.4)
         axes = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
         for name, axis in zip(names, axes, strict=True):
             for fed, style in STYLES.items():
@@ -181,7 +181,8 @@ def draw(runs: Runs, path: Path) -> None:
                 rates = [run.summary.average["SR"] for run in mine.values()]
                 values = [100 * (rate.value or 0.0) for rate in rates]
                 ends = [[100 * end for end in rate.interval or (0.0, 0.0)] for rate in rates]
-                bars = [(value - low, high - value) for value, (low, high) in zip(values, ends, strict=True)]
+                pairs = zip(values, ends, strict=True)  # at 0 and 100 an end may differ from the rate by rounding
+                bars = [(max(value - low, 0.0), max(high - value, 0.0)) for value, (low, high) in pairs]
                 shown = axis.errorbar([*mine], values, [*zip(*bars, strict=True)], ms=3.5, capsize=2, **style)
                 handles[f"memory fed at {fed}"] = shown
             axis.set_title(name)
