@@ -120,7 +120,7 @@ def runs_of(source: Path, names: Iterable[str]) -> Runs:
                 f"{source / name} is of other weights of {policy} than an earlier evaluation; delete it"
             )
         fed = PLANS if run.card[POLICY]["type"] == FED_AT_PLANS else STEPS
-        found[Place(name.partition("/")[0], run.protocol["replan_steps"], fed)] = run
+        found[Place(policy, run.protocol["replan_steps"], fed)] = run
     return {place: found[place] for place in sorted(found, key=lambda each: (*each[:2], FED.index(each.fed)))}
 
 

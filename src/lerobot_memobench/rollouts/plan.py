@@ -11,7 +11,7 @@ import itertools
 import secrets
 import shlex
 import typing
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -439,8 +439,7 @@ def with_batch_size(
         return settings
     learned = policy.type not in SCRIPTED and policy.device == "cpu"
     together = learned and settings.env.get("obs_type") == OBJECTS and not settings.use_async_envs
-    folders = (log, *sorted(log.glob(Shard.FOLDERS)))
-    if options.resume and (earlier := next(filter(None, map(earlier_batch_size, folders)), None)) is not None:
+    if options.resume and (earlier := earlier_batch_size(log)) is not None:
         return replace(settings, batch_size=earlier, use_async_envs=False if together else settings.use_async_envs)
     if (options.shards or options.shard is not None) and settings.batch_size is None:
         return replace(settings, batch_size=1)
@@ -453,17 +452,23 @@ def with_batch_size(
 
 
 def earlier_batch_size(log: Path) -> int | None:
-    """Return the batch size of the evaluation in a folder, None where it is not known."""
-    starts = read_evaluation(log).get("runs") if has_evaluation(log) else None
-    return int(starts[-1]["batch_size"]) if starts else None
+    """Return the batch size of the evaluation in a folder or in its parts, None where it is not known."""
+    for folder in begun_folders(log):
+        if starts := read_evaluation(folder).get("runs"):
+            return int(starts[-1]["batch_size"])
+    return None
+
+
+def begun_folders(log: Path) -> Iterator[Path]:
+    """Yield the folder of an evaluation and those of its parts, as far as they hold a card."""
+    return filter(has_evaluation, (log, *sorted(log.glob(Shard.FOLDERS))))
 
 
 def _salt(options: RunOptions, log: Path) -> Any:
     """Return a random salt for a sealed evaluation; a resumed one, or a part of it, keeps its salt."""
     if options.resume:
-        for folder in (log, *sorted(log.glob(Shard.FOLDERS))):
-            if has_evaluation(folder):
-                return read_evaluation(folder)["protocol"].get("salt")
+        for folder in begun_folders(log):
+            return read_evaluation(folder)["protocol"].get("salt")
     if options.shard is not None:  # its salt would differ from that of the other parts
         raise MemobenchError(
             f"found shard={options.shard} of a sealed test without salt=; start all parts by shards=, or give each "
